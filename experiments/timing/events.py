@@ -39,79 +39,65 @@ class Stall:
 
 
 @dataclass(frozen=True, slots=True)
-class Stop:
-    """The controller left ARMED or ACTIVE by itself at ``at_ns``."""
+class Event:
+    """A stop (with its reason) or lost frames, between two times; a stall of ``least_ns`` can have caused it."""
 
-    at_ns: int
-    reason: Reason
-    words: str
-
-
-@dataclass(frozen=True, slots=True)
-class Loss:
-    """Frames that the controller counted as lost on a bus between two pages."""
-
+    text: str
     from_ns: int
     to_ns: int
-    bus: str
-    refused: int
-    dropped: int
+    least_ns: int
+    frames: int = 0
+    reason: str = ""
 
-    @property
-    def frames(self) -> int:
-        """Frames lost in either direction."""
-        return self.refused + self.dropped
+
+def stop(at_ns: int, reason: Reason, words: str) -> Event:
+    """Tell that the controller left ARMED or ACTIVE by itself."""
+    return Event(f"stop, {reason.name}: {words}", at_ns, at_ns, STALL_NS, reason=reason.name)
+
+
+def loss(from_ns: int, to_ns: int, bus: str, refused: int, dropped: int) -> Event:
+    """Tell frames lost on a bus: refused ones need a stall that fills the transmit queue, others a longer one."""
+    text = f"{bus}: {refused} frames refused, {dropped} dropped"
+    return Event(text, from_ns, to_ns, TX_QUEUE_NS if refused else LOSING_STALL_NS, refused + dropped)
 
 
 @dataclass(frozen=True, slots=True)
 class Events:
     """Everything that was lost, stopped or stalled in one measurement."""
 
-    stops: list[Stop] = field(default_factory=list)
-    losses: list[Loss] = field(default_factory=list)
+    stops: list[Event] = field(default_factory=list)
+    losses: list[Event] = field(default_factory=list)
     stalls: list[Stall] = field(default_factory=list)
 
-    def cause(self, event: Stop | Loss) -> Stall | None:
-        """Find the longest stall of the host that can have caused a stop or a loss.
-
-        Refused frames need a stall that fills the transmit queue, other losses one that loses frames at any rate.
-        """
-        if isinstance(event, Stop):
-            from_ns, to_ns, least_ns = event.at_ns, event.at_ns, STALL_NS
-        else:
-            from_ns, to_ns = event.from_ns, event.to_ns
-            least_ns = TX_QUEUE_NS if event.refused else LOSING_STALL_NS
+    def cause(self, event: Event) -> Stall | None:
+        """Find the longest stall of the host that can have caused a stop or a loss."""
         fitting = [
             s
             for s in self.stalls
             if s.own_share < OWN_SHARE
-            and s.length_ns >= least_ns
-            and s.end_ns >= from_ns - REACH_NS
-            and s.end_ns - s.length_ns <= to_ns + STALL_NS
+            and s.length_ns >= event.least_ns
+            and s.end_ns >= event.from_ns - REACH_NS
+            and s.end_ns - s.length_ns <= event.to_ns + STALL_NS
         ]
         return max(fitting, key=lambda stall: stall.length_ns, default=None)
 
     def sentences(self) -> list[str]:
         """Write one sentence for every stop and loss: what, and the stall of the host before it."""
-        events: list[tuple[int, str, Stop | Loss]] = [
-            (s.at_ns, f"stop, {s.reason.name}: {s.words}", s) for s in self.stops
-        ]
-        events += [(x.to_ns, f"{x.bus}: {x.refused} frames refused, {x.dropped} dropped", x) for x in self.losses]
-        return [f"{text} [{_words(self.cause(event))}]" for _, text, event in sorted(events, key=lambda item: item[0])]
+        events = sorted([*self.stops, *self.losses], key=lambda event: event.to_ns)
+        return [f"{event.text} [{_words(self.cause(event))}]" for event in events]
 
 
 def _words(stall: Stall | None) -> str:
     return "not explained" if stall is None else f"processor {stall.cpu} stood still for {stall.length_ns / 1e6:.0f} ms"
 
 
-def losses_between(before: Facts, after: Facts) -> list[Loss]:
+def losses_between(before: Facts, after: Facts) -> list[Event]:
     """List the losses that the controller's counters show between two pages."""
-    losses = []
-    for old, new in zip(before.buses, after.buses, strict=True):
-        refused, dropped = new.refused - old.refused, new.dropped - old.dropped
-        if refused or dropped:
-            losses.append(Loss(before.written_ns, after.written_ns, new.name, refused, dropped))
-    return losses
+    counts = [
+        (new.name, new.refused - old.refused, new.dropped - old.dropped)
+        for old, new in zip(before.buses, after.buses, strict=True)
+    ]
+    return [loss(before.written_ns, after.written_ns, *count) for count in counts if any(count[1:])]
 
 
 def event_metrics(measured: Sequence[Events]) -> dict[str, float]:

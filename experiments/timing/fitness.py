@@ -105,7 +105,7 @@ class Figures:
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """The figures, and what else a reader of the report asks for."""
+    """The figures, and what else a reader asks for; ``interrupts`` of the controller's processor, by source."""
 
     figures: Figures
     bus: str
@@ -114,7 +114,6 @@ class Measured:
     tick: str
     stop_reasons: tuple[str, ...]
     interrupts: dict[str, int]
-    """Interrupts of the controller's processor during the measurement, by source; those that occurred."""
 
 
 def loopback_bus(profile_name: str) -> str:
@@ -151,27 +150,23 @@ def measure_computer(
             windows.append(measure(testbed, seconds / count, directory, with_cyclictest))
         after = _interrupts(testbed.cpu)
     ours, theirs, plain = loops(windows)
-    late = spread_us("late", ours)
-    beside = spread_us("reference", theirs if with_cyclictest else plain)
-    cost = spread_us("tick", pooled([w.durations["cpu"] for w in windows]))
-    process = process_metrics(windows)
+    process, stops = process_metrics(windows), testbed.events.stops
+    times_us = {
+        **spread_us("late", ours),
+        **spread_us("reference", theirs if with_cyclictest else plain),
+        **spread_us("tick", pooled([w.durations["cpu"] for w in windows])),
+    }
     figures = Figures(
         seconds=sum(w.host.seconds for w in windows),
         period_us=setting.period_ns / 1e3,
         ticks=sum(w.ticks for w in windows),
         missed=sum(w.missed for w in windows),
-        late_p50_us=late["late_p50_us"],
-        late_p99_us=late["late_p99_us"],
-        late_max_us=late["late_max_us"],
+        **{name: us for name, us in times_us.items() if name in Figures.__slots__},
         reference="cyclictest" if with_cyclictest else "sleep loop",
-        reference_p99_us=beside["reference_p99_us"],
-        reference_max_us=beside["reference_max_us"],
-        tick_p50_us=cost["tick_p50_us"],
-        tick_p99_us=cost["tick_p99_us"],
         frames_lost=sum(loss.frames for loss in losses_between(windows[0].begin, windows[-1].end)),
         page_faults=round(process["page_faults"]),
         gc_runs=round(process["gc_runs"]),
-        stops=len(testbed.events.stops),
+        stops=len(stops),
         fifo=granted["policy"] == "fifo",
         locked_kb=int(str(granted["locked_kb"])),
         refused=tuple(line.partition("not granted: ")[2] for line in error_lines if "not granted" in line),
@@ -179,7 +174,7 @@ def measure_computer(
         load_before=load_before,
         emulated=facts.machine == "user-mode Linux",
     )
-    reasons = tuple(sorted({stop.reason.name for stop in testbed.events.stops}))
+    reasons = tuple(sorted({stop.reason for stop in stops}))
     interrupts = {name: n - before.get(name, 0) for name, n in after.items() if n > before.get(name, 0)}
     return Measured(figures, bus, profile, testbed.cpu, windows[-1].end.tick, reasons, interrupts)
 
@@ -205,7 +200,16 @@ def disturbances(f: Figures) -> list[str]:
 
 def judge(f: Figures) -> tuple[Judgement, ...]:
     """Judge all topics."""
-    return (rights(f), wakeups(f), tick_cost(f), losses(f), memory(f), stops(f))
+    late = "the controller read too late: first correct wake-ups and rights; else send this report"
+    stopped = "the reasons are under 'stop_reasons'; correct wake-ups first"
+    return (
+        rights(f),
+        wakeups(f),
+        tick_cost(f),
+        _clocked(f, "frames", _graded(f.frames_lost), f"{f.frames_lost} frames were lost", late),
+        memory(f),
+        _clocked(f, "stops", _graded(f.stops), f"the supervisor stopped the machine {f.stops} times", stopped),
+    )
 
 
 def overall(found: Iterable[Judgement]) -> Verdict:
@@ -224,7 +228,7 @@ def _clocked(f: Figures, topic: str, verdict: Verdict, said: str, advice: str) -
     return Judgement(topic, verdict, said, advice)
 
 
-def _graded(share: float, good: float, marginal: float) -> Verdict:
+def _graded(share: float, good: float = 0.0, marginal: float = 0.0) -> Verdict:
     return Verdict.GOOD if share <= good else Verdict.MARGINAL if share <= marginal else Verdict.UNFIT
 
 
@@ -233,13 +237,9 @@ def rights(f: Figures) -> Judgement:
     if f.fifo and f.locked_kb and not f.refused:
         sentence = f"the controller runs with SCHED_FIFO and {f.locked_kb >> 10} MB of locked memory"
         return Judgement("rights", Verdict.GOOD, sentence)
-    refused = "; ".join(f.refused) or "no real-time priority or no locked memory"
-    return Judgement(
-        "rights",
-        Verdict.UNFIT,
-        f"the system refused: {refused}",
-        "run the report with sudo, or give this user the limits of the service (topics priority and memory below)",
-    )
+    sentence = f"the system refused: {'; '.join(f.refused) or 'no real-time priority or no locked memory'}"
+    advice = "run the report with sudo, or give this user the limits of the service (topics priority and memory below)"
+    return Judgement("rights", Verdict.UNFIT, sentence, advice)
 
 
 def wakeups(f: Figures) -> Judgement:
@@ -269,16 +269,8 @@ def tick_cost(f: Figures) -> Judgement:
         return Judgement("tick", Verdict.INCONCLUSIVE, "no tick was measured", "measure again")
     sentence = f"a tick takes {f.tick_p50_us:.0f} us of CPU time in the median, {f.tick_p99_us:.0f} at p99"
     advice = "compile the tick (timberhand compile), set the governor to performance, or use a faster processor"
-    return _clocked(
-        f, "tick", _graded(f.tick_p99_us / f.period_us, GOOD_TICK_SHARE, MARGINAL_TICK_SHARE), sentence, advice
-    )
-
-
-def losses(f: Figures) -> Judgement:
-    """Judge the frames refused by a bus or lost before they were read."""
-    advice = "the controller read too late: first correct wake-ups and rights; else send this report"
-    verdict = Verdict.UNFIT if f.frames_lost else Verdict.GOOD
-    return _clocked(f, "frames", verdict, f"{f.frames_lost} frames were lost", advice)
+    verdict = _graded(f.tick_p99_us / f.period_us, GOOD_TICK_SHARE, MARGINAL_TICK_SHARE)
+    return _clocked(f, "tick", verdict, sentence, advice)
 
 
 def memory(f: Figures) -> Judgement:
@@ -286,21 +278,14 @@ def memory(f: Figures) -> Judgement:
     sentence = f"{f.page_faults} page faults, {f.gc_runs} runs of the garbage collector"
     if not f.page_faults and not f.gc_runs:
         return Judgement("memory", Verdict.GOOD, sentence)
+    advice = "memory was locked, so this should be 0: send this report"
     if f.page_faults and not f.locked_kb:
-        return Judgement("memory", Verdict.MARGINAL, sentence, "memory is not locked; see the topic rights")
-    return Judgement("memory", Verdict.MARGINAL, sentence, "memory was locked, so this should be 0: send this report")
-
-
-def stops(f: Figures) -> Judgement:
-    """Judge the stops of the machine by its supervisor."""
-    sentence = f"the supervisor stopped the machine {f.stops} times"
-    advice = "the reasons are under 'stop_reasons'; correct wake-ups first"
-    return _clocked(f, "stops", Verdict.UNFIT if f.stops else Verdict.GOOD, sentence, advice)
+        advice = "memory is not locked; see the topic rights"
+    return Judgement("memory", Verdict.MARGINAL, sentence, advice)
 
 
 REMOVED: Final = "(removed)"
-_SYSTEM: Final = r"etc|proc|sys|dev"
-_PATH: Final = re.compile(rf"(?<![\w.:/])/(?!(?:{_SYSTEM})\b)\w[^\s'\"`,;)|]*/[^\s'\"`,;)|]*")
+_PATH: Final = re.compile(r"(?<![\w.:/])/(?!(?:etc|proc|sys|dev)\b)\w[^\s'\"`,;)|]*/[^\s'\"`,;)|]*")
 _COMMON: Final = frozenset({"root", "localhost", ""})
 VERSION: Final = 1
 

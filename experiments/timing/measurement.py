@@ -38,20 +38,17 @@ _CALLS: Final = re.compile(r"^\s*[\d.]+\s+[\d.]+\s+\d+\s+(\d+)\s+(?:\d+\s+)?(\w+
 
 
 @dataclass(frozen=True, slots=True)
-class SleepLoopReport:
-    """Lateness and missed deadlines of the sleep loop; processor time of one of its cycles [us]."""
-
-    lateness: Durations
-    missed: int
-    cpu_us: float
-
-
-@dataclass(frozen=True, slots=True)
 class MeasurementWindow(Span):
-    """One window of the controller, with the reference loops over the same time, and the host's activity."""
+    """One window of the controller, with the reference loops over the same time, and the host's activity.
+
+    ``plain`` is the lateness of the sleep loop, ``plain_missed`` its missed deadlines, ``plain_cpu_us`` the processor
+    time of one of its cycles.
+    """
 
     cyclictest: Durations
-    sleep_loop: SleepLoopReport
+    plain: Durations
+    plain_missed: int
+    plain_cpu_us: float
     host: host_activity.HostActivity
 
 
@@ -74,9 +71,8 @@ def measure(testbed: TimingTestbed, seconds: float, directory: Path, with_cyclic
         testbed.helpers.launch("cyclictest", "cyclictest", *how.split(), *when.split(), f"--json={report}")
         testbed.wait(START_S)
     first, mark = host_activity.sample(), testbed.mark()
-    child = testbed.helpers.start(
-        "sleep-loop", "experiments.timing.sleep_loop", period_us=period_ns // 1000, seconds=seconds
-    )
+    module = "experiments.timing.sleep_loop"
+    child = testbed.helpers.start("sleep-loop", module, period_us=period_ns // 1000, seconds=seconds)
     os.sched_setaffinity(child.process.pid, {testbed.cpu})
     output = testbed.await_end("sleep-loop", seconds + GRACE_S)
     span, last = testbed.since(mark), host_activity.sample()
@@ -88,7 +84,7 @@ def measure(testbed: TimingTestbed, seconds: float, directory: Path, with_cyclic
         span.durations,
         span.instructions,
         read_cyclictest(report.read_text()) if with_cyclictest else Durations(),
-        read_sleep_loop(output),
+        *read_sleep_loop(output),
         host_activity.between(first, last),
     )
 
@@ -108,12 +104,12 @@ def read_cyclictest(report: str) -> Durations:
     return histogram
 
 
-def read_sleep_loop(output: dict[str, Any]) -> SleepLoopReport:
-    """Parse the output of the sleep loop."""
+def read_sleep_loop(output: dict[str, Any]) -> tuple[Durations, int, float]:
+    """Parse the output of the sleep loop: its lateness, missed deadlines, processor time of a cycle [us]."""
     lateness = Durations(longest_ns=output["longest_ns"])
     for i, n in output["bins"].items():
         lateness.bins[int(i)] = n
-    return SleepLoopReport(lateness, output["missed"], output["cpu_us"])
+    return lateness, output["missed"], output["cpu_us"]
 
 
 @contextlib.contextmanager
@@ -124,16 +120,14 @@ def load(testbed: TimingTestbed, seconds: float) -> Iterator[None]:
     """
     cores = len(os.sched_getaffinity(0))
     memory = ("--vm", 1, "--vm-bytes", "128m")
-    child = testbed.helpers.launch(
-        "load", "stress-ng", "--quiet", "--cpu", cores, *memory, "--timeout", f"{seconds:.0f}s"
-    )
+    words = ("--quiet", "--cpu", cores, *memory, "--timeout", f"{seconds:.0f}s")
+    child = testbed.helpers.launch("load", "stress-ng", *words)
     testbed.wait(LOAD_SETTLES_S)
     try:
         yield
         if child.process.poll() is not None:
-            raise CommandFailed(
-                "timing.load-ended", f"stress-ng ended before its time: {child.complaint()}", ExitCode.CONFIGURATION
-            )
+            why = f"stress-ng ended before its time: {child.complaint()}"
+            raise CommandFailed("timing.load-ended", why, ExitCode.CONFIGURATION)
     finally:
         testbed.helpers.stop("load")
 
@@ -147,10 +141,12 @@ def system_calls(testbed: TimingTestbed, seconds: float, directory: Path) -> tup
     table.unlink(missing_ok=True)
     pid = testbed.family.children["controller"].process.pid
     child = testbed.helpers.launch("strace", "strace", "-c", "-f", "-p", pid, "-o", table)
-    testbed.until(
-        lambda: "attached" in child.errors.read_text() or child.process.poll() is not None, GRACE_S, period_s=0.005
-    )
-    if "attached" not in child.errors.read_text():
+
+    def attached() -> bool:
+        return "attached" in child.errors.read_text()
+
+    testbed.until(lambda: attached() or child.process.poll() is not None, GRACE_S, period_s=0.005)
+    if not attached():
         testbed.helpers.stop("strace")
         return None
     begin, begin_s = testbed.timing().facts, time.monotonic()

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from statistics import median
 from typing import Final
 
 import numpy as np
@@ -62,6 +63,13 @@ def _missed(end: str, where: str) -> tuple[Metric, ...]:
     return tuple(Metric(name, title, "", MISSED) for name, title in named.items())
 
 
+_FAST: Final = (
+    "The limit is 25 % of the period; quietest windows. The wire bus runs at 4 Mbit/s: ten frames of 8 bytes per "
+    "millisecond do not fit on a CAN bus of 1 Mbit/s."
+)
+_FILLED: Final = "No witness saw a stall before that is long enough to fill the transmit queue, or of 25 ms."
+_BLOCKS: Final = "Of the interpreter: minimum of the second half of the windows less minimum of the first half."
+_SWITCHES: Final = "One wait for SYNC and one for the tick."
 _INTERPRETER: Final = "Kept recordings (`timberhand bench tick`), the smaller ratio of the two machines."
 OWN: Final = Section(
     "Cost of the controller",
@@ -89,48 +97,23 @@ OWN: Final = Section(
         Metric("tick_instructions", "Instructions of the controller per tick", "", "perf_event_open(2), with waits."),
         Metric("compiled_ratio_cold", "Interpreter over compiled tick, cold caches", "x", _INTERPRETER, least=2.0),
         Metric("compiled_ratio_hot", "Interpreter over compiled tick, hot caches", "x", _INTERPRETER, least=2.0),
-        Metric(
-            "tick1k_cpu_p99_us",
-            "CPU time of a tick at 1 kHz, fixed crane, p99",
-            "us",
-            "The limit is 25 % of the period; quietest windows. The wire bus runs at 4 Mbit/s: ten frames of 8 "
-            "bytes per millisecond do not fit on a CAN bus of 1 Mbit/s.",
-            most=250.0,
-        ),
+        Metric("tick1k_cpu_p99_us", "CPU time of a tick at 1 kHz, fixed crane, p99", "us", _FAST, most=250.0),
         Metric("cpu_share", "CPU load of the controller at 200 Hz", "%", "getrusage, quiet windows."),
         Metric("frames_per_s", "Frames received and sent, both buses", "1/s", "The controller's own counters."),
         Metric(
             "frames_lost", "Frames refused by a bus or lost before they were read", "", "Its own counters.", most=0.0
         ),
-        Metric(
-            "frames_lost_unexplained",
-            "Lost frames without a stall of the host",
-            "",
-            "No witness saw a stall before that is long enough to fill the transmit queue, or of 25 ms.",
-            most=0.0,
-        ),
+        Metric("frames_lost_unexplained", "Lost frames without a stall of the host", "", _FILLED, most=0.0),
         Metric("machine_frames_lost", "Frames lost by the emulated machine", ""),
         Metric("records_lost", "Tick records lost on the way to the observer", "", "By their nominal times."),
         Metric("stalls", "Stalls of a processor that a witness saw", "", "3 ms or longer, whole measurement."),
         Metric("stall_max_ms", "Longest of them", "ms", "By the witness's own lateness."),
         Metric("page_faults", "Page faults", "", "Minor and major, all quiet windows.", most=0.0),
         Metric("gc_runs", "Runs of the garbage collector", "", most=0.0),
-        Metric(
-            "allocated_blocks_growth",
-            "Growth of allocated memory blocks",
-            "",
-            "Of the interpreter: minimum of the second half of the windows less minimum of the first half.",
-            most=0.0,
-        ),
+        Metric("allocated_blocks_growth", "Growth of allocated memory blocks", "", _BLOCKS, most=0.0),
         Metric("resident_growth_kb", "Growth of resident memory", "kB", "First to last reading.", most=0.0),
         Metric("syscalls_per_tick", "System calls per tick", "", "By strace, after the measurement.", most=60.0),
-        Metric(
-            "voluntary_switches_per_tick",
-            "Voluntary context switches per tick",
-            "",
-            "One wait for SYNC and one for the tick.",
-            most=2.05,
-        ),
+        Metric("voluntary_switches_per_tick", "Voluntary context switches per tick", "", _SWITCHES, most=2.05),
         Metric("involuntary_switches_per_tick", "Involuntary context switches per tick", ""),
     ),
     (("stages.png", "Duration of the stages of a tick: median, p99 and longest (log scale)."),),
@@ -158,6 +141,7 @@ WAKEUPS: Final = Section(
     ),
     (("wakeups.png", "Lateness of wake-ups on a quiet host and with every core loaded; dashed: one period."),),
 )
+_STALLED: Final = "No witness saw a stall of 10 ms or more in the 0.45 s before."
 LOADED: Final = Section(
     "Wake-ups with every core loaded",
     "stress-ng keeps every core and the memory busy. The sleep loop runs during the same seconds on the same core and "
@@ -166,45 +150,26 @@ LOADED: Final = Section(
         *_lateness("_loaded", "", "p50", "p99"),
         *_missed("", ""),
         Metric(
-            "missed_loaded_share",
-            "Deadlines missed, controller over sleep loop",
-            "%",
-            "200 Hz.",
-            most=MAX_MISSED_SHARE,
+            "missed_loaded_share", "Deadlines missed, controller over sleep loop", "%", "200 Hz.", most=MAX_MISSED_SHARE
         ),
         *_lateness("1k", " at 1 kHz, quiet", "p99"),
         Metric("missed_1k", "Deadlines missed by the controller at 1 kHz, quiet", "", "Fixed crane."),
         *_missed("_1k", " at 1 kHz"),
         Metric("stops", "Stops of the machine in the whole measurement", "", "Late inputs or a late loop.", most=0.0),
-        Metric(
-            "stops_unexplained",
-            "Stops without a stall of the host",
-            "",
-            "No witness saw a stall of 10 ms or more in the 0.45 s before.",
-            most=0.0,
-        ),
+        Metric("stops_unexplained", "Stops without a stall of the host", "", _STALLED, most=0.0),
     ),
 )
 FRAME: Final = "On this host, the same frames (`timberhand bench bus`)."
+_SAMPLE: Final = "From the encoders' sample to the valve command"
+_SYNC: Final = "From the time stamp of SYNC on the wire bus to the command passed to the bus, 200 Hz, quiet windows."
+_PERIOD: Final = "The limit is one period."
 LATENCY: Final = Section(
     "From sample to command",
     "The encoders sample on SYNC; the tick that uses the samples sends the valve command. The wire bus gives every "
     "frame its transmission time.",
     (
-        Metric(
-            "sample_to_command_p50_us",
-            "From the encoders' sample to the valve command, median",
-            "us",
-            "From the time stamp of SYNC on the wire bus to the command passed to the bus, 200 Hz, quiet windows.",
-        ),
-        Metric(
-            "sample_to_command_p99_us",
-            "From the encoders' sample to the valve command, p99",
-            "us",
-            "The limit is one period.",
-            most=5000.0,
-            clocked=True,
-        ),
+        Metric("sample_to_command_p50_us", f"{_SAMPLE}, median", "us", _SYNC),
+        Metric("sample_to_command_p99_us", f"{_SAMPLE}, p99", "us", _PERIOD, most=5000.0, clocked=True),
         Metric("rx_decode_us", "Receiving and decoding one frame, raw socket", "us", FRAME, most=5.0, clocked=True),
         Metric("rx_decode_pythoncan_us", "Receiving and decoding one frame, python-can", "us", FRAME),
     ),
@@ -256,7 +221,10 @@ def gather(slow: Measured, fast: Measured) -> tuple[dict[str, float], list[Measu
     """Compute all metrics of the testbeds at 200 Hz and at 1 kHz, and select the windows to compare."""
     compared, enough = compared_windows(slow.quiet)
     pressures = [w.host.pressure for w in slow.quiet if w.host.pressure is not None]
-    metrics = {
+    ours, theirs = [w.durations["wake"] for w in compared], [w.cyclictest for w in compared]
+    executed = [w.instructions for w in slow.quiet if w.instructions is not None]
+    ticks = sum(w.ticks for w in slow.quiet)
+    return {
         **process_metrics(slow.quiet),
         "host_verdict": float(enough),
         "windows": float(len(slow.quiet)),
@@ -281,33 +249,27 @@ def gather(slow: Measured, fast: Measured) -> tuple[dict[str, float], list[Measu
         "missed": float(sum(w.missed for w in compared)),
         "ticks_1k": float(sum(w.ticks for w in fast.quiet)),
         "missed_1k": float(sum(w.missed for w in fast.quiet)),
-    }
-    for name, share in (("p50", 0.5), ("p99", 0.99)):
-        ours, theirs = [w.durations["wake"] for w in compared], [w.cyclictest for w in compared]
-        metrics |= ratio(f"wakeup_{name}_ratio", ours, theirs, share)
-    executed = [w.instructions for w in slow.quiet if w.instructions is not None]
-    if executed:
-        metrics["tick_instructions"] = sum(executed) / max(1, sum(w.ticks for w in slow.quiet))
-    return metrics, compared
+        **ratio("wakeup_p50_ratio", ours, theirs, 0.5),
+        **ratio("wakeup_p99_ratio", ours, theirs, 0.99),
+        **({"tick_instructions": sum(executed) / max(1, ticks)} if executed else {}),
+    }, compared
 
 
 def quiet(window: MeasurementWindow) -> bool:
     """Tell whether cyclictest and the steal counter show a quiet host."""
     period_ns = window.end.period_ns
-    return (
-        window.cyclictest.longest_ns <= QUIET_LONGEST_SHARE * period_ns
-        and window.cyclictest.quantile_ns(0.99) <= QUIET_P99_SHARE * period_ns
-        and window.host.steal_ms <= QUIET_STEAL_SHARE * 1e3 * window.host.seconds
-    )
+    longest_ns, p99_ns = QUIET_LONGEST_SHARE * period_ns, QUIET_P99_SHARE * period_ns
+    return window.cyclictest.longest_ns <= longest_ns and _calm(window, p99_ns)
 
 
 def still(window: MeasurementWindow) -> bool:
     """Tell whether the host left the processor and its caches alone, as far as cyclictest, steal and pressure tell."""
-    return (
-        window.cyclictest.quantile_ns(0.99) <= STILL_P99_NS
-        and window.host.steal_ms <= QUIET_STEAL_SHARE * 1e3 * window.host.seconds
-        and (window.host.pressure or 0.0) <= STILL_PRESSURE
-    )
+    return (window.host.pressure or 0.0) <= STILL_PRESSURE and _calm(window, STILL_P99_NS)
+
+
+def _calm(window: MeasurementWindow, p99_ns: float) -> bool:
+    stolen_ms = QUIET_STEAL_SHARE * 1e3 * window.host.seconds
+    return window.cyclictest.quantile_ns(0.99) <= p99_ns and window.host.steal_ms <= stolen_ms
 
 
 def compared_windows(windows: Sequence[MeasurementWindow]) -> tuple[list[MeasurementWindow], bool]:
@@ -323,14 +285,12 @@ def quietest_windows(windows: Sequence[MeasurementWindow]) -> list[MeasurementWi
     The loop does the same in every cycle, on the same processor in the same seconds.  What makes it dear, other
     machines' work in the shared caches, makes a tick dear; cyclictest's lateness does not tell these windows apart.
     """
-    ordered = sorted(windows, key=lambda w: w.sleep_loop.cpu_us)
+    ordered = sorted(windows, key=lambda w: w.plain_cpu_us)
     return ordered[: max(1, math.ceil(COST_WINDOW_SHARE * len(ordered)))]
 
 
 def cost_metrics(name: str, windows: Sequence[MeasurementWindow]) -> dict[str, float]:
-    """Compute the processor time of a tick in the quietest windows and in all, and whether the host was still in the
-    former.
-    """
+    """Compute the processor time of a tick, in the quietest windows and in all; was the host still in the former?"""
     judged = quietest_windows(windows)
     metrics = spread_us(name, pooled([w.durations["cpu"] for w in judged]))
     metrics |= spread_us(f"{name}_all", pooled([w.durations["cpu"] for w in windows]))
@@ -338,14 +298,12 @@ def cost_metrics(name: str, windows: Sequence[MeasurementWindow]) -> dict[str, f
 
 
 def host_speed(windows: Sequence[MeasurementWindow]) -> dict[str, float]:
-    """Compute the sleep loop's processor time per cycle [us], and the tick's median in such cycles: the median
-    window's.
-    """
-    in_cycles = [w.durations["cpu"].quantile_ns(0.5) / 1e3 / w.sleep_loop.cpu_us for w in windows]
+    """Compute the sleep loop's processor time per cycle [us], and the tick's median in such cycles; median windows."""
+    in_cycles = [w.durations["cpu"].quantile_ns(0.5) / 1e3 / w.plain_cpu_us for w in windows]
     return {
-        "plain_cpu_us": float(np.median([w.sleep_loop.cpu_us for w in quietest_windows(windows)])),
-        "plain_cpu_all_us": float(np.median([w.sleep_loop.cpu_us for w in windows])),
-        "tick_cpu_in_plain": float(np.median(in_cycles)),
+        "plain_cpu_us": median(w.plain_cpu_us for w in quietest_windows(windows)),
+        "plain_cpu_all_us": median(w.plain_cpu_us for w in windows),
+        "tick_cpu_in_plain": median(in_cycles),
     }
 
 
@@ -376,9 +334,7 @@ def spread_us(name: str, histogram: Durations) -> dict[str, float]:
 
 
 def ratio(name: str, ours: Sequence[Durations], theirs: Sequence[Durations], share: float) -> dict[str, float]:
-    """Compute the ratio of a quantile over all windows as metric ``name``, with the 95 % interval of the windows' own
-    ratios.
-    """
+    """Compute the ratio of a quantile over all windows, with the 95 % interval of the windows' own ratios."""
 
     def of(a: Durations, b: Durations) -> float:
         below = quantile_us(b, share)
@@ -407,10 +363,8 @@ def process_metrics(windows: Sequence[MeasurementWindow]) -> dict[str, float]:
 
 
 def block_growth(readings: Sequence[Facts]) -> float:
-    """Compute the growth of the interpreter's memory blocks: minimum of the second half of the readings less that of
-    the first.
-
-    The minima remove blocks that come and go between readings.
+    """Compute the growth of the interpreter's memory blocks between the halves of the readings, of their minima:
+    blocks come and go.
     """
     blocks = [facts.process.allocated_blocks for facts in readings]
     half = max(1, len(blocks) // 2)
@@ -426,7 +380,7 @@ def system_call_metrics(calls: tuple[dict[str, int], float] | None) -> dict[str,
 
 def loops(windows: Sequence[MeasurementWindow]) -> tuple[Durations, Durations, Durations]:
     """Add up the histograms of controller, cyclictest and sleep loop over all windows."""
-    histograms = [(w.durations["wake"], w.cyclictest, w.sleep_loop.lateness) for w in windows]
+    histograms = [(w.durations["wake"], w.cyclictest, w.plain) for w in windows]
     ours, theirs, plain = (pooled(column) for column in zip(*histograms, strict=True))
     return ours, theirs, plain
 
@@ -440,7 +394,7 @@ def wakeups(mark: str, windows: Sequence[MeasurementWindow]) -> dict[str, float]
 
 def loaded(end: str, windows: Sequence[MeasurementWindow]) -> dict[str, float]:
     """Count the missed deadlines of the three loops under load; ``end`` is the suffix of the metric names."""
-    ours, plain = sum(w.missed for w in windows), sum(w.sleep_loop.missed for w in windows)
+    ours, plain = sum(w.missed for w in windows), sum(w.plain_missed for w in windows)
     return {
         f"missed_loaded{end}": float(ours),
         f"missed_loaded_plain{end}": float(plain),
@@ -458,13 +412,11 @@ def undecided(metrics: Mapping[str, float]) -> dict[str, str]:
     def need(name: str, count: float, least: int, unit: str) -> bool:
         if count < least:
             reasons[name] = f"{count:.0f} {unit} are too few; at least {least} are needed"
-        return count < least
+        return count >= least
 
     for name in ("wakeup_p50_ratio", "wakeup_p99_ratio"):
-        if not quiet_host:
-            reasons[name] = noisy
-        else:
-            need(name, cycles, MIN_RATIO_CYCLES, "cycles")
+        need(name, cycles, MIN_RATIO_CYCLES, "cycles")
+        reasons |= {} if quiet_host else {name: noisy}
     if not metrics["missed"]:
         need("missed", cycles, MIN_MISS_CYCLES, "cycles")
     elif not quiet_host:
@@ -472,11 +424,11 @@ def undecided(metrics: Mapping[str, float]) -> dict[str, str]:
     for name in ("page_faults", "gc_runs", "allocated_blocks_growth"):
         if metrics[name] <= 0.0:
             need(name, ticks, MIN_STEADY_TICKS, "ticks")
+    limits = {m.name: m.most or math.inf for m in METRICS}
     cost = {"tick_cpu_p50_us": ticks, "tick_cpu_p99_us": ticks, "tick1k_cpu_p99_us": metrics.get("ticks_1k", 0.0)}
     for name, count in cost.items():
-        most = next(m.most for m in METRICS if m.name == name) or math.inf
-        enough = not need(name, count, MIN_CPU_TICKS, "ticks")
-        if enough and metrics[name] > most and not metrics[f"{name.partition('_p')[0]}_host_still"]:
+        still_host = metrics[f"{name.partition('_p')[0]}_host_still"]
+        if need(name, count, MIN_CPU_TICKS, "ticks") and metrics[name] > limits[name] and not still_host:
             reasons[name] = "even the quietest windows were noisy, and noise adds to the processor time"
     reasons |= explained(metrics)
     if not quiet_host and metrics.get("sample_to_command_p99_us", 0.0) > metrics["period_us"]:

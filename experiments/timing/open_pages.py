@@ -8,18 +8,18 @@ interval: other load and shared caches change it.
 
 from __future__ import annotations
 
-import statistics
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from statistics import median
 from threading import Thread
 from typing import Any, Final
 
 from websockets.sync.client import ClientConnection, connect
 
 from experiments.timing.measurement import system_calls
-from experiments.timing.testbed import HOST, START_S, TestbedConfig, TimingTestbed
+from experiments.timing.testbed import HOST, WAIT_S, TestbedConfig, TimingTestbed
 from hil.harness.processes import free_udp_ports
 from hil.tick.compare import compared
 
@@ -37,8 +37,8 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """Some seconds of the controller: ``calls`` is the number of system calls of a tick, ``instructions`` that of
-    instructions (None: not counted here), ``frames`` that of frames sent; ``states`` went to the pages meanwhile."""
+    """Some seconds of the controller, its system calls, instructions and sent frames per tick (None: not counted here);
+    ``states`` went to the pages meanwhile."""
 
     ticks: int
     missed: int
@@ -56,24 +56,14 @@ def measure(rounds: int, seconds: float, pages: int, directory: Path, progress: 
         CommandFailed: a process does not start or ends.
     """
     reports, port = free_udp_ports(2)
-    setting = TestbedConfig(PROFILE, RATE_HZ, report_ports=(reports,))
     windows: dict[str, list[Window]] = {"none": [], "open": []}
-    with TimingTestbed(setting, directory) as testbed:
+    with TimingTestbed(TestbedConfig(PROFILE, RATE_HZ, report_ports=(reports,)), directory) as testbed:
         testbed.helpers.environment = testbed.family.environment  # the console listens on the same wire
-        testbed.helpers.start(
-            "console",
-            "console",
-            profile=PROFILE,
-            port=port,
-            report_port=reports,
-            timing=testbed.page,
-            bus="crane0=wire:crane0",
-            key_file=testbed.key_file,
-        )
-        testbed.helpers.await_message("console", "url", START_S)
+        options = {"profile": PROFILE, "port": port, "report_port": reports, "timing": testbed.page}
+        testbed.helpers.start("console", "console", **options, bus="crane0=wire:crane0", key_file=testbed.key_file)
+        testbed.helpers.await_message("console", "url", WAIT_S)
         for number in range(rounds):
-            order = ("none", "open") if number % 2 == 0 else ("open", "none")
-            for side in order:
+            for side in ("none", "open") if number % 2 == 0 else ("open", "none"):
                 progress(f"round {number + 1} of {rounds}: {pages if side == 'open' else 'no'} pages")
                 with _opened(testbed, port, pages if side == "open" else 0) as states:
                     window = _window(testbed, seconds, directory)
@@ -109,8 +99,8 @@ def _window(testbed: TimingTestbed, seconds: float, directory: Path) -> Window:
     traced = system_calls(testbed, seconds, directory)
     sent = [sum(bus.sent for bus in facts.buses) for facts in (span.begin, span.end)]
     return Window(
-        ticks=span.ticks,
-        missed=span.missed,
+        span.ticks,
+        span.missed,
         cpu_us=span.cpu_ns / span.ticks / 1e3,
         frames=(sent[1] - sent[0]) / span.ticks,
         instructions=None if span.instructions is None else span.instructions / span.ticks,
@@ -128,7 +118,7 @@ def judge(found: dict[str, list[Window]]) -> dict[str, Any]:
     ratio = compared([w.cpu_us for w in found["none"]], [w.cpu_us for w in found["open"]], MIN_RATIO)
     return {
         "counts": counts,
-        "cpu": {side: round(statistics.median(w.cpu_us for w in found[side]), 1) for side in found} | ratio,
+        "cpu": {side: round(median(w.cpu_us for w in found[side]), 1) for side in found} | ratio,
         "missed": {side: sum(w.missed for w in found[side]) for side in found},
         "ticks": {side: sum(w.ticks for w in found[side]) for side in found},
         "states": sum(w.states for w in found["open"]),
@@ -137,11 +127,9 @@ def judge(found: dict[str, list[Window]]) -> dict[str, Any]:
 
 
 def _compared(found: dict[str, list[Window]], name: str) -> dict[str, Any]:
-    sides: dict[str, float] = {}
-    for side, windows in found.items():
-        values = [value for w in windows if (value := getattr(w, name)) is not None]
-        if not values:
-            return {"none": None, "open": None, "same": None}
-        sides[side] = statistics.median(values)
+    counted = {side: [v for w in windows if (v := getattr(w, name)) is not None] for side, windows in found.items()}
+    if not all(counted.values()):
+        return {"none": None, "open": None, "same": None}
+    sides = {side: median(values) for side, values in counted.items()}
     same = abs(sides["open"] - sides["none"]) <= SAME * sides["none"]
     return {side: round(value, 2) for side, value in sides.items()} | {"same": same}

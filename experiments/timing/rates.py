@@ -49,6 +49,7 @@ REPLAY_TICKS: Final = 1000
 PERIOD_NS: Final = 5_000_000
 REPLAY: Final = "experiments.timing.replayed_crane"
 LINES: Final = (*((f"{machine}_frame", title) for machine, title in MACHINES.items()), ("function", "Functions"))
+LOAD: Final = ("frames_per_s", "cpu_share")
 MAX_RESIDUAL: Final = 0.1
 """Of a straight line, as a share of its largest value."""
 
@@ -87,7 +88,7 @@ class CranePoint:
 
 
 def functions_of(machine: str) -> int:
-    """List the functions of a machine: its joints, the grapple, and on a carrier articulation, drive and swing arms."""
+    """Count the functions of a machine: joints, grapple, and on a carrier articulation, drive and swing arms."""
     return len(JOINTS) + 1 + (CARRIER_FUNCTIONS if load_profile(machine).carrier else 0)
 
 
@@ -142,8 +143,8 @@ def measure_cranes(ticks: int, directory: Path, counts: Sequence[int]) -> list[C
     with tempfile.TemporaryDirectory() as folder:
         for recording in kept_recordings(Path(folder)):
             for cranes in counts:
-                tries = [run_cranes(recording, cranes, ticks, directory)]
-                while not tries[-1].carried and len(tries) < TRIES:
+                tries: list[CranePoint] = []
+                while len(tries) < TRIES and not any(point.carried for point in tries):
                     tries.append(run_cranes(recording, cranes, ticks, directory))
                 points.append(min(tries, key=lambda point: point.missed))
                 if not points[-1].carried:
@@ -154,8 +155,7 @@ def measure_cranes(ticks: int, directory: Path, counts: Sequence[int]) -> list[C
 def run_cranes(recording: Path, cranes: int, ticks: int, directory: Path) -> CranePoint:
     """Run so many controllers on the testbed's last processor, their ticks spread over the period."""
     cpu, _ = cores()
-    family = ProcessGroup(directory)
-    outputs: dict[str, dict[str, Any]] = {}
+    family, outputs = ProcessGroup(directory), dict[str, dict[str, Any]]()
     start_ns = time.monotonic_ns() + round((3.0 + 2.0 * cranes) * 1e9)
     try:
         for k in range(cranes):
@@ -173,12 +173,8 @@ def run_cranes(recording: Path, cranes: int, ticks: int, directory: Path) -> Cra
             time.sleep(0.05)
     finally:
         family.stop_all(())
-    replays = list(outputs.values())
-    return CranePoint(
-        Path(manifest_of(files_of(recording)).profile).stem,
-        cranes,
-        *(sum(x[name] for x in replays) for name in ("ticks", "missed", "differing", "cpu_us")),
-    )
+    totals = (sum(x[name] for x in outputs.values()) for name in ("ticks", "missed", "differing", "cpu_us"))
+    return CranePoint(Path(manifest_of(files_of(recording)).profile).stem, cranes, *totals)
 
 
 def fit(x: Sequence[float], y: Sequence[float]) -> tuple[float, float, float]:
@@ -190,6 +186,12 @@ def fit(x: Sequence[float], y: Sequence[float]) -> tuple[float, float, float]:
     return float(slope), float(intercept), float(residual / max(y))
 
 
+def loads(points: Sequence[RatePoint], machine: str) -> tuple[list[float], list[float]]:
+    """List frames per second and load of a machine at every rate."""
+    frames_per_s, shares = ([p.figures[name] for p in points if p.machine == machine] for name in LOAD)
+    return frames_per_s, shares
+
+
 def gather(points: Sequence[RatePoint], cranes: Sequence[CranePoint]) -> dict[str, float]:
     """Compute all metrics."""
     fast = next(p for p in points if p.machine == FORWARDER and p.rate_hz == max(q.rate_hz for q in points))
@@ -199,18 +201,15 @@ def gather(points: Sequence[RatePoint], cranes: Sequence[CranePoint]) -> dict[st
         "differing_ticks": float(sum(c.differing for c in cranes)),
     }
     for machine in MACHINES:
-        rate_figures = {p.rate_hz: p.figures for p in points if p.machine == machine}
-        lines = [[f[name] for f in rate_figures.values()] for name in ("frames_per_s", "cpu_share")]
-        slope, intercept, residual = fit(*lines)
+        by_rate = {p.rate_hz: p.figures for p in points if p.machine == machine}
+        slope, intercept, residual = fit(*loads(points, machine))
         metrics |= {f"{machine}_frame_us": slope * 1e6, f"{machine}_rest_share": intercept}
         metrics[f"{machine}_frame_residual"] = residual
-        metrics |= {
-            f"{machine}_{hz}_{n}": f[n] for hz, f in rate_figures.items() for n in ("cpu_share", "frames_per_s")
-        }
+        metrics |= {f"{machine}_{hz}_{name}": f[name] for hz, f in by_rate.items() for name in LOAD}
         carried = [c.cranes for c in cranes if c.machine == machine and c.carried]
         metrics[f"{machine}_cranes"] = float(max(carried, default=0))
         metrics[f"{machine}_cranes_bound"] = (
-            math.floor(0.95 / rate_figures[200]["cpu_share"]) if 200 in rate_figures else math.nan
+            math.floor(0.95 / by_rate[200]["cpu_share"]) if 200 in by_rate else math.nan
         )
     slope, _, residual = fit([float(c.functions) for c in cranes], [c.cpu_us for c in cranes])
     return metrics | {"function_us": slope, "function_residual": residual}
@@ -292,14 +291,11 @@ def draw(points: Sequence[RatePoint], cranes: Sequence[CranePoint], path: Path) 
     """Load against frames for each machine, and cost against functions for all controllers, with their lines."""
     with sheet(path, 2, height=3.4) as axes:
         for machine, colour in zip(MACHINES, (OIL, MOSS), strict=True):
-            machine_figures = [p.figures for p in points if p.machine == machine]
-            crane_points = [c for c in cranes if c.machine == machine]
-            frames, loads = ([f[name] for f in machine_figures] for name in ("frames_per_s", "cpu_share"))
-            axes[0].plot(frames, [100 * share for share in loads], "o", color=colour, label=machine)
-            axes[1].plot(
-                [c.functions for c in crane_points], [c.cpu_us for c in crane_points], "o", color=colour, label=machine
-            )
-            _line(axes[0], frames, [100 * share for share in loads], colour)
+            frames_per_s, shares = loads(points, machine)
+            here = [c for c in cranes if c.machine == machine]
+            axes[1].plot([c.functions for c in here], [c.cpu_us for c in here], "o", color=colour, label=machine)
+            axes[0].plot(frames_per_s, [100 * share for share in shares], "o", color=colour, label=machine)
+            _line(axes[0], frames_per_s, [100 * share for share in shares], colour)
         _line(axes[1], [float(c.functions) for c in cranes], [c.cpu_us for c in cranes], STEEL)
         axes[1].axhline(PERIOD_NS / 1e3, color=RUST, ls="--", lw=0.8)
         axes[0].set(xlabel="frames per second", ylabel="CPU load [%]")

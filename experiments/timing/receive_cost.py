@@ -43,12 +43,12 @@ LIMIT_US: Final = 5.0
 QUIET_S: Final = 0.1
 """A kernel interface is used only if nothing was received on it for this time."""
 _SO_TIMESTAMPNS: Final = 35
+Clock = Callable[[], int]
+Send = Callable[[list[RawFrame]], None]
 
 
 def traffic(database: Database) -> Iterator[RawFrame]:
-    """Make the frames that the controller receives on crane0, by cycle time, with valid values and running E2E
-    counters.
-    """
+    """Make the frames that the controller receives on crane0, by cycle time: valid values, running E2E counters."""
     rng = random.Random(1)
     received = [c for c in database.messages.values() if c.cycle_time_ns and "CTRL" not in c.senders]
     messages = [(c, _payload(c, rng), Sender(c.data_ids) if c.data_ids else None) for c in received]
@@ -91,7 +91,7 @@ class Lane:
 
     name: str
     label: str
-    send: Callable[[list[RawFrame]], None]
+    send: Send
     drain: Callable[[list[Any]], object]
     messages: bool = False
 
@@ -100,9 +100,8 @@ def measure(frames: int, rounds: int) -> dict[str, Any]:
     """Measure every available path alternately, in rounds of ``frames`` frames each.
 
     ``metrics``: ``rx_us`` and ``rx_decode_us`` of the fast path, the same of python-can's, and ``rx_decode_ratio``,
-    its cost by ours.  ``lab``: measured in user-mode Linux, where a system call costs a
-    hundred times as much, so that only the ratio is meaningful.  Raises `CommandFailed` when the bus is in
-    use.
+    its cost by ours.  ``lab``: in user-mode Linux, where a system call costs a hundred times as much, only the ratio
+    is meaningful.  Raises `CommandFailed` when the bus is in use.
     """
     database = load("crane")
     clock, clock_name = _clock()
@@ -112,11 +111,8 @@ def measure(frames: int, rounds: int) -> dict[str, Any]:
         time.sleep(QUIET_S)
         for lane in lanes:
             if _discard(lane):
-                raise CommandFailed(
-                    "receive-cost.bus-in-use",
-                    f"{lane.label}: the bus is in use; stop what runs on it, then measure.",
-                    ExitCode.BUS,
-                )
+                why = f"{lane.label}: the bus is in use; stop what runs on it, then measure."
+                raise CommandFailed("receive-cost.bus-in-use", why, ExitCode.BUS)
         supply = {lane.name: traffic(database) for lane in lanes}
         readers = {lane.name: Reader(database) for lane in lanes}
         gc.collect()
@@ -129,9 +125,8 @@ def measure(frames: int, rounds: int) -> dict[str, Any]:
                 samples.setdefault(f"rx_decode_{lane.name}_us", []).append((rx_ns + decode_ns) / frames / 1000)
     for name, reader in readers.items():
         if reader.accepted < rounds * frames - 200:  # the first frame of each stream only initializes its counter
-            raise InputRefused(
-                "experiment.frames-rejected", f"path {name} accepted {reader.accepted} of {rounds * frames} frames"
-            )
+            why = f"path {name} accepted {reader.accepted} of {rounds * frames} frames"
+            raise InputRefused("experiment.frames-rejected", why)
     metrics = {name.replace("_ours", ""): median(values) for name, values in samples.items()}
     metrics["rx_decode_ratio"] = metrics["rx_decode_pythoncan_us"] / metrics["rx_decode_us"]
     return {
@@ -145,9 +140,7 @@ def measure(frames: int, rounds: int) -> dict[str, Any]:
     }
 
 
-def _round(
-    lane: Lane, supply: Iterator[RawFrame], reader: Reader, frames: int, clock: Callable[[], int]
-) -> tuple[int, int]:
+def _round(lane: Lane, supply: Iterator[RawFrame], reader: Reader, frames: int, clock: Clock) -> tuple[int, int]:
     """Measure the time [ns] of receiving, and of checking and decoding, for one round."""
     _discard(lane)  # on an interface every socket received the frames of the other paths
     read = reader.read_messages if lane.messages else reader.read
@@ -163,11 +156,8 @@ def _round(
         decode_ns += clock() - middle_ns
         rx_ns += middle_ns - begin_ns
         if len(received) != frame_count:
-            raise CommandFailed(
-                "receive-cost.frames-missing",
-                f"{lane.label} gave {len(received)} of {frame_count} frames; is anybody else sending?",
-                ExitCode.BUS,
-            )
+            why = f"{lane.label} gave {len(received)} of {frame_count} frames; is anybody else sending?"
+            raise CommandFailed("receive-cost.frames-missing", why, ExitCode.BUS)
     return rx_ns, decode_ns
 
 
@@ -183,9 +173,8 @@ def _discard(lane: Lane) -> int:
 
 def _lanes(stack: contextlib.ExitStack) -> tuple[Lane, ...]:
     """Open every path of this machine: ours, python-can's, python-can as a bus."""
-    present = {name for _, name in socket.if_nameindex()} if kernel_has_can() else set()
-    interface = next((name for name in ("vcan0", "vcan1") if name in present), None)
-    return _on_pairs(stack) if interface is None else _on_interface(interface, stack)
+    present = {name for _, name in socket.if_nameindex()} & {"vcan0", "vcan1"} if kernel_has_can() else ()
+    return _on_interface(min(present), stack) if present else _on_pairs(stack)
 
 
 def _on_interface(interface: str, stack: contextlib.ExitStack) -> tuple[Lane, ...]:
@@ -197,9 +186,8 @@ def _on_interface(interface: str, stack: contextlib.ExitStack) -> tuple[Lane, ..
 
     def send(frames: list[RawFrame]) -> None:
         if sender.send_all(frames) != len(frames):
-            raise CommandFailed(
-                "receive-cost.interface-blocked", "The interface takes no frames; see `ip link`.", ExitCode.BUS
-            )
+            why = "The interface takes no frames; see `ip link`."
+            raise CommandFailed("receive-cost.interface-blocked", why, ExitCode.BUS)
 
     return (
         Lane("ours", f"ours on {interface}", send, ours.drain),
@@ -217,21 +205,10 @@ class _OnPair(SocketcanBus):
         self._is_filtered = self._is_shutdown = True
 
 
-class _BusOnPair(PythonCanBus):
-    """python-can behind our contract, on a given socket."""
-
-    def __init__(self, sock: socket.socket) -> None:
-        self._sock = sock
-        super().__init__("socketcan", "pair")
-
-    def _open(self) -> can.BusABC:
-        return _OnPair(self._sock)
-
-
 def _on_pairs(stack: contextlib.ExitStack) -> tuple[Lane, ...]:
     """Open ours, python-can's and python-can as a bus, each on an AF_UNIX datagram pair."""
 
-    def pair() -> tuple[socket.socket, Callable[[list[RawFrame]], None]]:
+    def pair() -> tuple[socket.socket, Send]:
         near, far = map(stack.enter_context, socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM))
 
         def send(frames: list[RawFrame]) -> None:
@@ -243,13 +220,19 @@ def _on_pairs(stack: contextlib.ExitStack) -> tuple[Lane, ...]:
     (ours, to_ours), (theirs, to_theirs), (behind, to_behind) = pair(), pair(), pair()
     link, stats = FrameSocket(ours), BusStats()
 
+    class BusOnPair(PythonCanBus):
+        def _open(self) -> can.BusABC:
+            return _OnPair(behind)
+
     def drain(frames: list[Any]) -> None:
         link.receive(frames, DRAIN_LIMIT, stats.note_error)
 
     return (
         Lane("ours", "ours on an AF_UNIX pair", to_ours, drain),
         Lane("pythoncan", "python-can on an AF_UNIX pair", to_theirs, _recv_all(_OnPair(theirs)), True),
-        Lane("pythoncan_bus", "--bus python-can:... on an AF_UNIX pair", to_behind, _BusOnPair(behind).drain),
+        Lane(
+            "pythoncan_bus", "--bus python-can:... on an AF_UNIX pair", to_behind, BusOnPair("socketcan", "pair").drain
+        ),
     )
 
 
@@ -263,17 +246,14 @@ def _recv_all(bus: can.BusABC) -> Callable[[list[Any]], object]:
 
 def _payload(codec: MessageCodec, rng: random.Random) -> bytes:
     """Make the payload of the message with every value in range and available."""
+    ranges = [(s.physical(s.raw_low), s.physical(s.raw_high)) for s in codec.signals]
     while True:
-        values = []
-        for s in codec.signals:
-            low, high = s.physical(s.raw_low), s.physical(s.raw_high)
-            values.append(low + (high - low) * rng.random())
-        payload = codec.encode(*values)
+        payload = codec.encode(*(low + (high - low) * rng.random() for low, high in ranges))
         if None not in codec.receive(payload):
             return payload
 
 
-def _clock() -> tuple[Callable[[], int], str]:
+def _clock() -> tuple[Clock, str]:
     """Return this thread's CPU time; wall time where the kernel counts CPU time in ticks, as user-mode Linux does."""
     begin_ns = time.thread_time_ns()
     deadline_ns = time.perf_counter_ns() + 1_000_000

@@ -15,11 +15,15 @@ import time
 from can_dbc.timing.durations import Durations
 
 
-def run(period_ns: int, seconds: float) -> tuple[Durations, int]:
-    """Measure the lateness of every wake-up, and the periods skipped."""
-    lateness, missed = Durations(), 0
-    deadline_ns = time.monotonic_ns() + period_ns
-    end_ns = deadline_ns + round(seconds * 1e9)
+def main() -> None:
+    """Run the command line."""
+    parser = argparse.ArgumentParser(prog="python -m experiments.timing.sleep_loop")
+    parser.add_argument("--period-us", type=int, required=True)
+    parser.add_argument("--seconds", type=float, required=True)
+    options = parser.parse_args()
+    period_ns, lateness, missed = 1000 * options.period_us, Durations(), 0
+    begin_ns, deadline_ns = time.thread_time_ns(), time.monotonic_ns() + period_ns
+    end_ns = deadline_ns + round(options.seconds * 1e9)
     while deadline_ns < end_ns:
         time.sleep(max(0, deadline_ns - time.monotonic_ns()) * 1e-9)
         late_ns = time.monotonic_ns() - deadline_ns
@@ -27,17 +31,6 @@ def run(period_ns: int, seconds: float) -> tuple[Durations, int]:
         skipped = late_ns // period_ns
         missed += skipped
         deadline_ns += (1 + skipped) * period_ns
-    return lateness, missed
-
-
-def main() -> None:
-    """Run the command line."""
-    parser = argparse.ArgumentParser(prog="python -m experiments.timing.sleep_loop")
-    parser.add_argument("--period-us", type=int, required=True)
-    parser.add_argument("--seconds", type=float, required=True)
-    options = parser.parse_args()
-    begin_ns = time.thread_time_ns()
-    lateness, missed = run(1000 * options.period_us, options.seconds)
     cpu_us = (time.thread_time_ns() - begin_ns) / 1e3 / max(1, lateness.count)
     bins = {str(i): n for i, n in enumerate(lateness.bins) if n}
     summary = {"bins": bins, "longest_ns": lateness.longest_ns, "missed": missed, "cpu_us": round(cpu_us, 3)}

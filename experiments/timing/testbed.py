@@ -25,16 +25,18 @@ from can_dbc.messages.operator_link import guard_path
 from can_dbc.timing.durations import Durations
 from can_dbc.timing.page import Facts, Timing, read_timing
 from experiments.common import host_activity
-from experiments.timing.events import Events, Stall, Stop, losses_between
+from experiments.timing.events import Events, Stall, losses_between, stop
 from hil.harness.processes import ProcessGroup, free_udp_ports
 from hil.tick.instructions import INSTRUCTIONS, count, open_counter
 from hil.wire.core import BITRATES
 from host.exit_codes import CommandFailed, ExitCode
 from machine.loading.profile_file import load_profile
+from machine.status.modes import STOPPED
 from machine.status.reasons import Reason
 from runtime.errors import InputRefused
 
 HOST: Final = "127.0.0.1"
+STAND_INS: Final = "experiments.timing.stand_ins"
 PRIORITY: Final = {"wire": 60, "machine": 50, "setpoints": 30, "witness": 90, "witness-controller": 79}
 OBSERVER_NICENESS: Final = -20
 HARNESS_PRIORITY: Final = 10
@@ -45,11 +47,10 @@ WITNESS_US: Final = {"witness": 1000, "witness-controller": 2000}
 """Longest periods of the witnesses, at most the controller's: a stall is seen shorter by up to one period.  Beside the
 controller the witness wakes below it and less often, so that it does not disturb it."""
 END_ORDER: Final = ("setpoints", "controller", "guard", "observer", "machine", "wire")
-STOPPED: Final = ("STOP", "FAULT")
-START_S: Final = 60.0
-ACTIVE_S: Final = 60.0
+WAIT_S: Final = 60.0
+"""For a process to start or to end, and for the machine to move."""
 PAGE_S: Final = 5.0
-HELPER_ENDS_S: Final = 60.0
+_STOPPED: Final = tuple(mode.name for mode in STOPPED)
 MEMORY: Final = Path("/dev/shm")  # only mkdtemp makes names in it  # nosec B108
 """The timing page lies in memory: a write to a page of a disk file can fault and wait for the disk."""
 
@@ -120,7 +121,7 @@ class TimingTestbed:
     """A running testbed.
 
     ``helpers`` are processes that run beside it for a while.  ``status`` holds the newest message of each process, and
-    ``events`` what was lost, stopped or stalled.
+    ``events`` what was lost, stopped or stalled.  Where a method waits, CommandFailed says that a process has ended.
     """
 
     def __init__(self, setting: TestbedConfig, directory: Path) -> None:
@@ -152,21 +153,14 @@ class TimingTestbed:
         self.close()
 
     def start(self) -> None:
-        """Start everything and wait until the machine moves; the harness itself runs above the load of the host.
-
-        Raises:
-            CommandFailed: a process does not start, or the machine does not become ACTIVE.
-        """
+        """Start everything and wait until the machine moves; the harness itself runs above the load of the host."""
         with contextlib.suppress(OSError):  # without the privilege the window edges are less precise
             os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(HARNESS_PRIORITY))
-        s = self.setting
-        common: dict[str, object] = {"profile": s.profile}
-        profile = load_profile(s.profile)
+        s, profile = self.setting, load_profile(self.setting.profile)
         names = [b for b in (profile.crane_bus, profile.machine_bus) if b]
         vcan, rates, cycle_us = s.bus == "vcan", dict(s.bitrates), min(5000, s.period_ns // 1000)
-        buses = [f"{n}=" + (f"socketcan:{VCAN_NAMES[n]}" if vcan else f"wire:{n}") for n in names]
         control, reports = free_udp_ports(2)
-        ticks, operators, key = self._private / "controller.ticks", self._operators, write_key(self.key_file)
+        ticks, key = self._private / "controller.ticks", write_key(self.key_file)
         own_cpu = None if self.cpu in self.others else self.cpu
         if not vcan:
             self._start("wire", "hil.wire.daemon", bus=[f"{n}:{rates[n]}" for n in names])
@@ -174,21 +168,19 @@ class TimingTestbed:
             if cpu is not None:
                 self._start(name, "experiments.common.stall_witness", period_us=min(WITNESS_US[name], cycle_us))
                 os.sched_setaffinity(self.family.children[name].process.pid, {cpu})
-        self._start("machine", "experiments.timing.emulated_machine", **common, bus=buses, cycle_us=cycle_us)
-        self._start(
-            "setpoints",
-            "experiments.timing.setpoint_source",
-            **common,
-            controller=f"{HOST}:{control}",
-            operator=operators,
-            report_port=reports,
-            key_file=key,
-        )
-        self._start("observer", "experiments.timing.bus_observer", **common, rate=s.rate_hz, ticks=ticks)
-        common |= {"bus": buses, "rate": s.rate_hz, "operator": operators}
+        common: dict[str, object] = {
+            "profile": s.profile,
+            "bus": [f"{n}=" + (f"socketcan:{VCAN_NAMES[n]}" if vcan else f"wire:{n}") for n in names],
+            "rate": s.rate_hz,
+            "operator": self._operators,
+        }
+        self._start("machine", STAND_INS, "machine", **common, cycle_us=cycle_us)
+        to = f"{HOST}:{control}"
+        self._start("setpoints", STAND_INS, "setpoints", **common, controller=to, report_port=reports, key_file=key)
+        self._start("observer", STAND_INS, "observer", **common, ticks=ticks)
         guard = self.family.start("guard", "controller.guard", **common, state=self.page.with_suffix(".latched"))
         os.sched_setaffinity(guard.process.pid, self.others)
-        self.family.start(
+        controller = self.family.start(
             "controller",
             "controller",
             **common,
@@ -199,17 +191,17 @@ class TimingTestbed:
             key_file=key,
             cpu=own_cpu,
         )
-        self._counter = open_counter(self.family.children["controller"].process.pid, INSTRUCTIONS)
-        if not self.until(lambda: self.mode == "ACTIVE" and self.page.exists(), ACTIVE_S):
+        self._counter = open_counter(controller.process.pid, INSTRUCTIONS)
+        if not self.until(lambda: self.mode == "ACTIVE" and self.page.exists(), WAIT_S):
             raise CommandFailed(
                 "timing-testbed.not-moving",
                 f"the machine does not move on the timing testbed: {self.status.get('setpoints', 'no report')}",
                 ExitCode.SAFETY_STOP,
             )
 
-    def _start(self, name: str, module: str, **options: object) -> None:
-        child = self.family.start(name, module, **options)
-        self.family.await_message(name, "ready", START_S)
+    def _start(self, name: str, module: str, *words: object, **options: object) -> None:
+        child = self.family.start(name, module, *words, **options)
+        self.family.await_message(name, "ready", WAIT_S)
         if name in PRIORITY:
             self.family.set_fifo_priority(name, PRIORITY[name])
         else:  # it only reads what the ring holds for seconds
@@ -217,11 +209,7 @@ class TimingTestbed:
         os.sched_setaffinity(child.process.pid, self.others)
 
     def poll(self) -> None:
-        """Read the messages of all processes.
-
-        Raises:
-            CommandFailed: one of them has ended.
-        """
+        """Read the messages of all processes."""
         gone = self.family.dead()
         now_s = time.monotonic()
         if not self._cpu_s or now_s - self._cpu_s[-1][0] >= 0.5:
@@ -230,12 +218,17 @@ class TimingTestbed:
         for name, message in self.family.messages():
             self.status[name] = self.status.get(name, {}) | message
             if "stall_ns" in message:
-                cpu = min(self.others) if name == "witness" else self.cpu
-                own = self._own_share() if name == "witness" else 0.0
-                self.events.stalls.append(Stall(cpu, message["end_ns"], message["stall_ns"], own))
+                shared = name == "witness"
+                stall = Stall(
+                    min(self.others) if shared else self.cpu,
+                    message["end_ns"],
+                    message["stall_ns"],
+                    self._own_share() if shared else 0.0,
+                )
+                self.events.stalls.append(stall)
             if name == "setpoints" and message.get("event") == "mode":
-                if message["mode"] in STOPPED and self._was not in STOPPED:
-                    self.events.stops.append(Stop(message["stamp_ns"], Reason(message["reason"]), message["why"]))
+                if message["mode"] in _STOPPED and self._was not in _STOPPED:
+                    self.events.stops.append(stop(message["stamp_ns"], Reason(message["reason"]), message["why"]))
                 self._was = message["mode"]
         if gone is not None:
             code = gone.process.returncode
@@ -261,9 +254,9 @@ class TimingTestbed:
     def counters(self) -> Counter[str]:
         """Return the counts of observer and emulated machine so far; a machine alone on its bus has frames refused."""
         observed, rig = (Counter(self.status.get(name, {})) for name in ("observer", "machine"))
-        bus_counts = Counter({name: observed[name] for name in ("received", "sent", "gaps", "unanswered")})
-        return bus_counts + Counter(
+        return Counter(
             {
+                **{name: observed[name] for name in ("received", "sent", "gaps", "unanswered")},
                 "damaged": observed["damaged"] + rig["damaged"],
                 "gaps_rig": rig["gaps"],
                 "records_lost": observed["records_lost"] + observed["records_unreadable"],
@@ -285,20 +278,12 @@ class TimingTestbed:
 
     def fresh_timing(self) -> Timing:
         """Wait for the next timing page that the controller writes; it writes one per second."""
-        now = before = self.timing()
-
-        def written() -> bool:
-            nonlocal now
-            now = self.timing()
-            return now.facts.written_ns != before.facts.written_ns
-
-        if not self.until(written, PAGE_S):
-            raise CommandFailed(
-                "timing-testbed.page-stale",
-                "the controller has stopped writing its timing page",
-                ExitCode.SAFETY_STOP,
-            )
-        return now
+        before_ns = self.timing().facts.written_ns
+        if not self.until(lambda: self.timing().facts.written_ns != before_ns, PAGE_S):
+            why = "the controller has stopped writing its timing page"
+            raise CommandFailed("timing-testbed.page-stale", why, ExitCode.SAFETY_STOP)
+        assert self._last is not None
+        return self._last
 
     def mark(self) -> Mark:
         """Begin a span with the next timing page."""
@@ -327,11 +312,7 @@ class TimingTestbed:
         self.until(lambda: False, seconds, 0.1)
 
     def await_end(self, name: str, seconds: float) -> dict[str, Any]:
-        """Wait until a helper ends by itself; returns its output.
-
-        Raises:
-            CommandFailed: it fails or does not end, or the testbed fails meanwhile.
-        """
+        """Wait until a helper ends by itself; returns its output, and raises CommandFailed if it fails or hangs."""
         child = self.helpers.children[name]
         output: dict[str, Any] = {}
 
@@ -342,21 +323,17 @@ class TimingTestbed:
             return gone
 
         if not self.until(ended, seconds, 0.05):
-            raise CommandFailed(
-                "timing-testbed.helper-hangs", f"{name} does not end; see {child.errors}", ExitCode.CONFIGURATION
-            )
+            why = f"{name} does not end; see {child.errors}"
+            raise CommandFailed("timing-testbed.helper-hangs", why, ExitCode.CONFIGURATION)
         self.end_helper(name)
         return output
 
     def end_helper(self, name: str) -> None:
         """Stop a helper that writes its report when it is stopped; raises CommandFailed if it failed."""
         complaint = self.helpers.children[name].complaint
-        if code := self.helpers.stop(name, HELPER_ENDS_S):
-            raise CommandFailed(
-                "timing-testbed.helper-failed",
-                f"{name} failed with exit code {code}: {complaint()}",
-                ExitCode.CONFIGURATION,
-            )
+        if code := self.helpers.stop(name, WAIT_S):
+            why = f"{name} failed with exit code {code}: {complaint()}"
+            raise CommandFailed("timing-testbed.helper-failed", why, ExitCode.CONFIGURATION)
 
     def close(self) -> None:
         """Stop everything, neutral commands first."""

@@ -107,8 +107,8 @@ def control_loop(checkout: Path) -> dict[str, Any]:
     from machine.status.modes import Mode
 
     bus = ("--profile", PROFILE, "--bus", f"crane0=socketcan:{LINKS[0]}")
-    nodes, _ = start(checkout, "experiments.timing.emulated_machine", *bus)
-    if not await_text(nodes, RUNTIME / "experiments.timing.emulated_machine.out", "ready"):
+    nodes, _ = start(checkout, "experiments.timing.stand_ins", "machine", *bus)
+    if not await_text(nodes, RUNTIME / "experiments.timing.stand_ins.out", "ready"):
         raise TimeoutError("the emulated nodes do not start")
     os.sched_setscheduler(nodes.pid, os.SCHED_FIFO, os.sched_param(NODES_PRIORITY))
     page, operator = RUNTIME / "controller.timing", RUNTIME / "controller.operator"

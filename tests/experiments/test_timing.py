@@ -18,8 +18,7 @@ from experiments.common import host_activity
 from experiments.common.host_activity import HostActivity
 from experiments.common.result import evaluate
 from experiments.timing import events, measurement
-from experiments.timing.bus_observer import Continuity
-from experiments.timing.measurement import MeasurementWindow, SleepLoopReport
+from experiments.timing.measurement import MeasurementWindow
 from experiments.timing.metrics import (
     METRICS,
     Measured,
@@ -33,6 +32,7 @@ from experiments.timing.metrics import (
     system_call_metrics,
     undecided,
 )
+from experiments.timing.stand_ins import Continuity
 from hil.tick import instructions
 from machine.status.reasons import Reason
 
@@ -56,11 +56,12 @@ def facts(ticks: int, missed: int = 0, faults: int = 0, blocks: int = 1000) -> F
 def window(
     late: Sequence[float] = (30.0,),
     theirs: Sequence[float] = (25.0,),
-    plain: SleepLoopReport | None = None,
+    plain_us: float = 400.0,
     *,
     ticks: int = 2000,
     at: int = 0,
     missed: int = 0,
+    plain_missed: int = 0,
     steal_ms: float = 0.0,
     faults: int = 0,
     cpu_us: float = 100.0,
@@ -75,7 +76,9 @@ def window(
         durations,
         None,
         histogram(*theirs, times=max(1, ticks // len(theirs))),
-        plain or SleepLoopReport(histogram(400.0, times=ticks), 0, loop_us),
+        histogram(plain_us, times=ticks),
+        plain_missed,
+        loop_us,
         HostActivity(10.0, steal_ms, 0.1, 0.5),
     )
 
@@ -124,9 +127,9 @@ def test_cyclictests_report_becomes_a_histogram():
 
 
 def test_the_output_of_the_sleep_loop_becomes_a_histogram():
-    plain = measurement.read_sleep_loop({"bins": {"5": 3}, "longest_ns": 5_500, "missed": 4, "cpu_us": 21.5})
-    assert plain.cpu_us == 21.5
-    assert plain.lateness.count == 3 and plain.missed == 4
+    output = {"bins": {"5": 3}, "longest_ns": 5_500, "missed": 4, "cpu_us": 21.5}
+    lateness, missed, cpu_us = measurement.read_sleep_loop(output)
+    assert lateness.count == 3 and missed == 4 and cpu_us == 21.5
 
 
 def test_system_calls_are_counted_from_the_tables_rows():
@@ -182,7 +185,7 @@ def test_a_ratio_compares_quantiles_and_has_an_interval():
 
 def test_a_long_quiet_run_is_evaluated_and_a_slow_loop_misses_its_limits():
     quiet = [window(late=[60.0], ticks=6000, at=6000 * i) for i in range(20)]
-    loaded = [window(plain=SleepLoopReport(histogram(9000.0), 500, 20.0))]
+    loaded = [window(plain_us=9000.0, plain_missed=500)]
     metrics = metrics_of(quiet, loaded)
     assert metrics["host_verdict"] == 1.0 and metrics["judged_cycles"] == 120_000
     missed, open_ = judged(metrics)
@@ -227,7 +230,7 @@ def test_a_deadline_missed_in_a_quiet_window_counts():
     ],
 )
 def test_missed_deadlines_under_load_are_compared_with_the_sleep_loop(ours, plain, theirs, outcome):
-    pressed = window(theirs=[theirs], plain=SleepLoopReport(histogram(9000.0), plain, 20.0), missed=ours)
+    pressed = window(theirs=[theirs], plain_us=9000.0, plain_missed=plain, missed=ours)
     metrics = metrics_of([window()], [pressed])
     missed, open_ = judged(metrics)
     name = "missed_loaded_share"
@@ -258,7 +261,7 @@ def outcome_of(stalls: list[events.Stall]) -> tuple[dict[str, float], tuple[str,
     before, after = facts(1800), facts(2000)
     bus = structs.replace(after.buses[0], refused=36)
     lost = events.losses_between(before, structs.replace(after, buses=(bus,)))
-    stop = events.Stop(10_000_000_000, Reason.ESTOP_LOST, "gone")
+    stop = events.stop(10_000_000_000, Reason.ESTOP_LOST, "gone")
     told = events.Events([stop], lost, stalls)
     assert len(told.sentences()) == 2
     slow = Measured([window()], [window()], events=told)
@@ -291,7 +294,7 @@ def test_a_loss_without_a_stall_long_enough_and_near_enough_counts(stalls):
 @pytest.mark.parametrize(("length_ms", "explained"), [(15, False), (22, True)])
 def test_a_short_stall_explains_refused_frames_only_where_it_fills_the_transmit_queue(length_ms, explained):
     """The frames of 20 ms wait for a bus, at any rate."""
-    lost = events.Loss(9_000_000_000, 10_000_000_000, "crane0", refused=5, dropped=0)
+    lost = events.loss(9_000_000_000, 10_000_000_000, "crane0", refused=5, dropped=0)
     stall = events.Stall(0, 9_950_000_000, length_ms * 1_000_000)
     assert (events.Events(losses=[lost], stalls=[stall]).cause(lost) is stall) is explained
 

@@ -9,7 +9,7 @@ import pytest
 
 from experiments.common.result import evaluate
 from experiments.timing import rates
-from experiments.timing.events import Events, Loss, Stall, Stop
+from experiments.timing.events import Events, Stall, loss, stop
 from experiments.timing.rates import METRICS, CranePoint, RatePoint
 from machine.status.reasons import Reason
 
@@ -72,8 +72,8 @@ def test_a_cost_that_grows_faster_than_the_frames_misses_its_limit():
 
 @pytest.mark.parametrize(("stalls", "open_"), [((), False), ((Stall(0, 9_990_000_000, 60_000_000),), True)])
 def test_a_loss_or_a_stop_counts_unless_a_witness_saw_the_host_stall(stalls, open_):
-    lost = Loss(9_000_000_000, 10_000_000_000, "crane0", 3, 0)
-    told = Events([Stop(10_000_000_000, Reason.ESTOP_LOST, "")], [lost], list(stalls))
+    lost = loss(9_000_000_000, 10_000_000_000, "crane0", 3, 0)
+    told = Events([stop(10_000_000_000, Reason.ESTOP_LOST, "")], [lost], list(stalls))
     missed, inconclusive = judged(points(straight, told))
     assert ({"frames_lost", "stops"} <= {*inconclusive}) is open_
     assert ({"frames_lost", "stops", "stops_unexplained"} <= {*missed}) is not open_

@@ -23,8 +23,7 @@ from controller.process.tick_recording import record
 from controller.step import Controller, step
 from controller.tick import Inputs
 from experiments.timing import soak
-from experiments.timing.bus_observer import BusObserver
-from experiments.timing.setpoint_source import STAMP_AGE_NS, SetpointSource, Swing
+from experiments.timing.stand_ins import STAMP_AGE_NS, BusObserver, SetpointSource, Swing
 from machine.joints import JOINTS
 from machine.loading.profile_file import load_profile
 from machine.status.modes import Mode
