@@ -81,10 +81,10 @@ class Events:
         ]
         return max(fitting, key=lambda stall: stall.length_ns, default=None)
 
-    def sentences(self) -> list[str]:
-        """Write one sentence for every stop and loss: what, and the stall of the host before it."""
+    def sentences(self, where: str = "") -> list[str]:
+        """Write one sentence for every stop and loss: where, what, and the stall of the host before it."""
         events = sorted([*self.stops, *self.losses], key=lambda event: event.to_ns)
-        return [f"{event.text} [{_words(self.cause(event))}]" for event in events]
+        return [f"{where}{': ' if where else ''}{event.text} [{_words(self.cause(event))}]" for event in events]
 
 
 def _words(stall: Stall | None) -> str:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from copy import deepcopy
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from rich.console import Console
 
@@ -16,10 +15,11 @@ from experiments.common import host_activity
 from experiments.common.registry import Options
 from experiments.common.result import Result, make_result
 from experiments.common.result_page import Page, publish
-from experiments.timing import metrics, plots
+from experiments.timing import metrics, plots, receive_cost
 from experiments.timing.measurement import MeasurementWindow, load, measure, missing_tools, system_calls
 from experiments.timing.metrics import METRICS, OTHERS, Measured
 from experiments.timing.testbed import TestbedConfig, TimingTestbed
+from hil.tick import compare
 from host.exit_codes import CommandFailed, ExitCode
 from machine.loading.profile_file import load_profile
 
@@ -31,8 +31,7 @@ OVERHEAD_S: Final = 5.0
 """A window waits for cyclictest's full second and for the controller's timing page at both ends."""
 
 
-@dataclass(frozen=True, slots=True)
-class Plan:
+class Plan(NamedTuple):
     """Number and length [s] of the windows of one testbed, quiet and loaded; warm-up and tracing time [s]."""
 
     quiet: int
@@ -45,8 +44,8 @@ class Plan:
     @property
     def seconds(self) -> float:
         """Approximate duration [s]."""
-        windows = self.quiet * (self.quiet_s + OVERHEAD_S) + self.loaded * (self.loaded_s + OVERHEAD_S)
-        return windows + self.warm_s + self.trace_s + 20.0
+        windows_s = self.quiet * (self.quiet_s + OVERHEAD_S) + self.loaded * (self.loaded_s + OVERHEAD_S)
+        return windows_s + self.warm_s + self.trace_s + 20.0
 
 
 FULL: Final = Plan(24, 24.0, 3, 20.0, 10.0, 4.0), Plan(3, 20.0, 3, 20.0, 10.0)
@@ -55,30 +54,21 @@ QUICK: Final = Plan(1, 5.0, 1, 3.0, 1.0, 1.0), Plan(1, 3.0, 1, 3.0, 1.0)
 
 
 def run(options: Options, console: Console) -> Result:
-    """Run the experiment; write ``options.out`` and, if requested, the docs.
-
-    Raises:
-        CommandFailed: a tool is missing or a process does not run.
-    """
+    """Run the experiment; write ``options.out`` and, if requested, the docs; a missing tool raises CommandFailed."""
     if missing := missing_tools():
-        tools, packages = ", ".join(missing), " ".join(missing.values())
         raise CommandFailed(
-            "timing.tools-missing", f"timing needs {tools}: apt-get install {packages}", ExitCode.CONFIGURATION
+            "timing.tools-missing",
+            f"timing needs {', '.join(missing)}: apt-get install {' '.join(missing.values())}",
+            ExitCode.CONFIGURATION,
         )
     plans = QUICK if options.quick else FULL
     machine, crane = machines(options.profile)
     console.print(f"timing: about {sum(p.seconds for p in plans) / 60:.0f} minutes; keep the machine idle meanwhile")
-    settings = (
-        TestbedConfig(machine, load_profile(machine).rate_hz),
-        TestbedConfig(crane, FAST_HZ, bitrates=(("crane0", FAST_BITRATE),)),
-    )
-    slow, fast = (
-        measure_testbed(setting, plan, options.out / name, console)
-        for setting, plan, name in zip(settings, plans, ("slow", "fast"), strict=True)
-    )
+    setting = TestbedConfig(machine, load_profile(machine).rate_hz)
+    slow = measure_testbed(setting, plans[0], options.out / "slow", console)
+    setting = TestbedConfig(crane, FAST_HZ, bitrates=(("crane0", FAST_BITRATE),))
+    fast = measure_testbed(setting, plans[1], options.out / "fast", console)
     measured_values, compared = metrics.gather(slow, fast)
-    from experiments.timing import receive_cost
-
     with console.status("timing: cost of a frame, interpreter and compiled tick") as status:
         measured_values |= receive_cost.measure(*((1_000, 3) if options.quick else (10_000, 9)))["metrics"]
         measured_values |= compiled_ratios(options.quick, status.update, console)
@@ -93,9 +83,7 @@ def run(options: Options, console: Console) -> Result:
         more={
             **host_activity.describe(),
             "host_verdict": "quiet enough" if measured_values["host_verdict"] else "inconclusive",
-            "events": "; ".join(
-                f"{hz} Hz: {text}" for hz, of in ((200, slow), (FAST_HZ, fast)) for text in of.events.sentences()
-            ),
+            "events": "; ".join([*slow.events.sentences("200 Hz"), *fast.events.sentences(f"{FAST_HZ} Hz")]),
             "instructions": "counted" if "tick_instructions" in measured_values else "not counted by this host",
             "tick": compared[-1].end.tick,
         },
@@ -133,18 +121,16 @@ def measure_testbed(setting: TestbedConfig, plan: Plan, directory: Path, console
     title = f"timing: {setting.profile} at {setting.rate_hz} Hz"
     with console.status(f"{title}: starting") as status, TimingTestbed(setting, directory) as testbed:
 
-        def windows(kind: str, number: int, length_s: float) -> list[MeasurementWindow]:
-            done: list[MeasurementWindow] = []
+        def windows(kind: str, number: int, length_s: float) -> Iterator[MeasurementWindow]:
             for i in range(number):
                 status.update(f"{title}: {kind} window {i + 1} of {number}")
-                done.append(measure(testbed, length_s, directory))
-            return done
+                yield measure(testbed, length_s, directory)
 
         testbed.wait(plan.warm_s)
         before = testbed.counters()
-        quiet = windows("quiet", plan.quiet, plan.quiet_s)
+        quiet = list(windows("quiet", plan.quiet, plan.quiet_s))
         with load(testbed, 2 * plan.loaded * (plan.loaded_s + OVERHEAD_S) + 60.0):
-            pressed = windows("loaded", plan.loaded, plan.loaded_s)
+            pressed = list(windows("loaded", plan.loaded, plan.loaded_s))
         testbed.wait(1.0)  # for the last words of every process
         after = testbed.counters()
         events = deepcopy(testbed.events)  # now, because tracing may stop the machine
@@ -155,13 +141,10 @@ def measure_testbed(setting: TestbedConfig, plan: Plan, directory: Path, console
 
 
 def compiled_ratios(quick: bool, progress: Callable[[str], None], console: Console) -> dict[str, float]:
-    """Measure how many times as fast the compiled tick is, caches cold and hot: the smaller ratio of the kept
-    recordings.
+    """Measure how many times as fast the compiled tick is, caches cold and hot: the smaller ratio of the recordings.
 
     NaN if there is no compiled tick or no recording.
     """
-    from hil.tick import compare
-
     names = ("compiled_ratio_cold", "compiled_ratio_hot")
     with tempfile.TemporaryDirectory() as folder:
         try:

@@ -78,15 +78,9 @@ def measure(testbed: TimingTestbed, seconds: float, directory: Path, with_cyclic
     span, last = testbed.since(mark), host_activity.sample()
     if with_cyclictest:
         testbed.end_helper("cyclictest")
-    return MeasurementWindow(
-        span.begin,
-        span.end,
-        span.durations,
-        span.instructions,
-        read_cyclictest(report.read_text()) if with_cyclictest else Durations(),
-        *read_sleep_loop(output),
-        host_activity.between(first, last),
-    )
+    ours = (span.begin, span.end, span.durations, span.instructions)
+    theirs = read_cyclictest(report.read_text()) if with_cyclictest else Durations()
+    return MeasurementWindow(*ours, theirs, *read_sleep_loop(output), host_activity.between(first, last))
 
 
 def offset_us(stamp_ns: int, period_ns: int) -> int:
@@ -126,8 +120,9 @@ def load(testbed: TimingTestbed, seconds: float) -> Iterator[None]:
     try:
         yield
         if child.process.poll() is not None:
-            why = f"stress-ng ended before its time: {child.complaint()}"
-            raise CommandFailed("timing.load-ended", why, ExitCode.CONFIGURATION)
+            raise CommandFailed(
+                "timing.load-ended", f"stress-ng ended before its time: {child.complaint()}", ExitCode.CONFIGURATION
+            )
     finally:
         testbed.helpers.stop("load")
 

@@ -58,8 +58,8 @@ def _lateness(mark: str, where: str, *keys: str) -> tuple[Metric, ...]:
 
 def _missed(end: str, where: str) -> tuple[Metric, ...]:
     """Define the deadlines that each loop missed under load."""
-    loops = {"": "controller", "_cyclictest": "cyclictest", "_plain": "sleep loop"}
-    named = {f"missed_loaded{loop}{end}": f"Deadlines missed{where}: {title}" for loop, title in loops.items()}
+    titles = {"": "controller", "_cyclictest": "cyclictest", "_plain": "sleep loop"}
+    named = {f"missed_loaded{loop}{end}": f"Deadlines missed{where}: {title}" for loop, title in titles.items()}
     return tuple(Metric(name, title, "", MISSED) for name, title in named.items())
 
 
@@ -235,7 +235,9 @@ def gather(slow: Measured, fast: Measured) -> tuple[dict[str, float], list[Measu
         **spread_us("sample_to_command", pooled([w.durations["sample_to_command"] for w in compared])),
         **cost_metrics("tick_cpu", slow.quiet),
         **cost_metrics("tick1k_cpu", fast.quiet),
-        **host_speed(slow.quiet),
+        "plain_cpu_us": median(w.plain_cpu_us for w in quietest_windows(slow.quiet)),
+        "plain_cpu_all_us": median(w.plain_cpu_us for w in slow.quiet),
+        "tick_cpu_in_plain": median(w.durations["cpu"].quantile_ns(0.5) / 1e3 / w.plain_cpu_us for w in slow.quiet),
         **wakeups("", compared),
         **wakeups("_loaded", slow.loaded),
         **wakeups("1k", fast.quiet),
@@ -295,16 +297,6 @@ def cost_metrics(name: str, windows: Sequence[MeasurementWindow]) -> dict[str, f
     metrics = spread_us(name, pooled([w.durations["cpu"] for w in judged]))
     metrics |= spread_us(f"{name}_all", pooled([w.durations["cpu"] for w in windows]))
     return metrics | {f"{name}_host_still": float(all(map(still, judged)))}
-
-
-def host_speed(windows: Sequence[MeasurementWindow]) -> dict[str, float]:
-    """Compute the sleep loop's processor time per cycle [us], and the tick's median in such cycles; median windows."""
-    in_cycles = [w.durations["cpu"].quantile_ns(0.5) / 1e3 / w.plain_cpu_us for w in windows]
-    return {
-        "plain_cpu_us": median(w.plain_cpu_us for w in quietest_windows(windows)),
-        "plain_cpu_all_us": median(w.plain_cpu_us for w in windows),
-        "tick_cpu_in_plain": median(in_cycles),
-    }
 
 
 def pooled(histograms: Sequence[Durations]) -> Durations:
@@ -387,9 +379,8 @@ def loops(windows: Sequence[MeasurementWindow]) -> tuple[Durations, Durations, D
 
 def wakeups(mark: str, windows: Sequence[MeasurementWindow]) -> dict[str, float]:
     """Compute the lateness of the wake-ups of controller, cyclictest and sleep loop; ``mark`` follows their names."""
-    ours, theirs, plain = loops(windows)
-    metrics = spread_us(f"wakeup{mark}", ours) | spread_us(f"cyclictest{mark}", theirs)
-    return metrics | spread_us(f"plain{mark}", plain)
+    spreads = [spread_us(f"{name}{mark}", lateness) for name, lateness in zip(LOOPS, loops(windows), strict=True)]
+    return {name: us for spread in spreads for name, us in spread.items()}
 
 
 def loaded(end: str, windows: Sequence[MeasurementWindow]) -> dict[str, float]:
@@ -437,8 +428,8 @@ def undecided(metrics: Mapping[str, float]) -> dict[str, str]:
     if ours and metrics["missed_loaded_cyclictest"] >= ours:
         reasons["missed_loaded_share"] = "cyclictest missed as many deadlines: the host withheld the processor"
     elif plain < MIN_PLAIN_MISSED and ours * 100.0 <= plain:
-        why = f"the sleep loop missed only {plain:.0f} deadlines, too few to decide a limit of one percent"
-        reasons["missed_loaded_share"] = why
+        few = f"the sleep loop missed only {plain:.0f} deadlines, too few to decide a limit of one percent"
+        reasons["missed_loaded_share"] = few
     return unmeasured(METRICS, metrics) | reasons
 
 

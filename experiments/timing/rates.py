@@ -115,7 +115,7 @@ def run(options: Options, console: Console) -> Result:
         more={
             **host_activity.describe(),
             "tick": points[-1].tick,
-            "events": "; ".join(f"{p.machine} {p.rate_hz} Hz: {text}" for p in points for text in p.events.sentences()),
+            "events": "; ".join(text for p in points for text in p.events.sentences(f"{p.machine} {p.rate_hz} Hz")),
         },
         undecided=undecided(metrics, points),
     )

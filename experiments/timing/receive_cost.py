@@ -62,13 +62,12 @@ class Reader:
     """Checks and decodes frames by key, as `controller.crane.inputs` does; ``accepted`` counts the good frames."""
 
     def __init__(self, database: Database) -> None:
-        self._slots = {
-            key: (Checker(codec.data_ids) if codec.data_ids else None, codec.receive)
-            for key, codec in database.by_key.items()
-        }
+        by_key = database.by_key.items()
+        self._slots = {key: (Checker(c.data_ids) if c.data_ids else None, c.receive) for key, c in by_key}
         self.accepted = 0
 
     def read(self, frames: Sequence[Frame]) -> None:
+        """Check and decode frames."""
         for _, key, data in frames:
             checker, receive = self._slots[key]
             if checker is None or checker.check(data).usable:
@@ -111,8 +110,11 @@ def measure(frames: int, rounds: int) -> dict[str, Any]:
         time.sleep(QUIET_S)
         for lane in lanes:
             if _discard(lane):
-                why = f"{lane.label}: the bus is in use; stop what runs on it, then measure."
-                raise CommandFailed("receive-cost.bus-in-use", why, ExitCode.BUS)
+                raise CommandFailed(
+                    "receive-cost.bus-in-use",
+                    f"{lane.label}: the bus is in use; stop what runs on it, then measure.",
+                    ExitCode.BUS,
+                )
         supply = {lane.name: traffic(database) for lane in lanes}
         readers = {lane.name: Reader(database) for lane in lanes}
         gc.collect()
@@ -125,8 +127,9 @@ def measure(frames: int, rounds: int) -> dict[str, Any]:
                 samples.setdefault(f"rx_decode_{lane.name}_us", []).append((rx_ns + decode_ns) / frames / 1000)
     for name, reader in readers.items():
         if reader.accepted < rounds * frames - 200:  # the first frame of each stream only initializes its counter
-            why = f"path {name} accepted {reader.accepted} of {rounds * frames} frames"
-            raise InputRefused("experiment.frames-rejected", why)
+            raise InputRefused(
+                "experiment.frames-rejected", f"path {name} accepted {reader.accepted} of {rounds * frames} frames"
+            )
     metrics = {name.replace("_ours", ""): median(values) for name, values in samples.items()}
     metrics["rx_decode_ratio"] = metrics["rx_decode_pythoncan_us"] / metrics["rx_decode_us"]
     return {
@@ -156,8 +159,11 @@ def _round(lane: Lane, supply: Iterator[RawFrame], reader: Reader, frames: int, 
         decode_ns += clock() - middle_ns
         rx_ns += middle_ns - begin_ns
         if len(received) != frame_count:
-            why = f"{lane.label} gave {len(received)} of {frame_count} frames; is anybody else sending?"
-            raise CommandFailed("receive-cost.frames-missing", why, ExitCode.BUS)
+            raise CommandFailed(
+                "receive-cost.frames-missing",
+                f"{lane.label} gave {len(received)} of {frame_count} frames; is anybody else sending?",
+                ExitCode.BUS,
+            )
     return rx_ns, decode_ns
 
 
@@ -186,8 +192,9 @@ def _on_interface(interface: str, stack: contextlib.ExitStack) -> tuple[Lane, ..
 
     def send(frames: list[RawFrame]) -> None:
         if sender.send_all(frames) != len(frames):
-            why = "The interface takes no frames; see `ip link`."
-            raise CommandFailed("receive-cost.interface-blocked", why, ExitCode.BUS)
+            raise CommandFailed(
+                "receive-cost.interface-blocked", "The interface takes no frames; see `ip link`.", ExitCode.BUS
+            )
 
     return (
         Lane("ours", f"ours on {interface}", send, ours.drain),

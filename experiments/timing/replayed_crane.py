@@ -42,20 +42,18 @@ class BusPair:
     """A bus whose far end is in this process."""
 
     def __init__(self) -> None:
-        near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
-        self.near, self._far = FrameSocket(near), FrameSocket(far)
+        self.near, self._far = map(FrameSocket, socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM))
         self._frames: list[Frame] = []
 
     def exchange(self, frames: Sequence[Frame]) -> None:
         """Take what was sent, and offer the frames of the next tick."""
-        self._frames.clear()
-        self._far.receive(self._frames, 1024, lambda _key, _data: False)
+        self.receive(self._far)
         self._far.send([(key, data) for _, key, data in frames])
 
-    def receive(self) -> None:
+    def receive(self, end: FrameSocket) -> None:
         """Receive as the controller does; the tick then runs on the recorded stamps."""
         self._frames.clear()
-        self.near.receive(self._frames, 1024, lambda _key, _data: False)
+        end.receive(self._frames, 1024, lambda _key, _data: False)
 
     def send(self, frames: Sequence[RawFrame]) -> None:
         """Send as the controller does."""
@@ -75,17 +73,15 @@ def main(arguments: list[str] | None = None) -> int:
     ticks = list(islice(recorded_ticks(files), options.ticks))
     settings = settings_for(manifest_of(files), ticks[:64], profile_beside(files))
     controller, inputs, buses = Controller(settings), Inputs(), (BusPair(), BusPair())
-    sink = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    sink, setpoints = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
     sink.bind(("127.0.0.1", 0))
-    setpoints = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     setpoints.setblocking(False)
-    address, period_ns, missed, differing = sink.getsockname(), settings.period_ns, 0, 0
+    address, period_ns, deadline_ns = sink.getsockname(), settings.period_ns, options.start_at
+    missed = differing = process_ns = 0
     gc.collect()
     gc.freeze()
     gc.disable()
     prepare(PRIORITY, options.cpu)
-    deadline_ns = options.start_at
-    process_ns = 0
     for tick in ticks:
         buses[0].exchange(tick.frames_in)
         buses[1].exchange(tick.machine_frames_in)
@@ -93,7 +89,7 @@ def main(arguments: list[str] | None = None) -> int:
         late_ns = time.monotonic_ns() - deadline_ns
         begin_ns = time.thread_time_ns()
         for bus in buses:
-            bus.receive()
+            bus.receive(bus.near)
         with contextlib.suppress(OSError):  # nothing waits
             setpoints.recv(2048)
         restore_inputs(inputs, tick)

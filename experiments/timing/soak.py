@@ -39,6 +39,8 @@ JITTER_BLOCKS: Final = 8.0
 STOP_BLOCKS: Final = 40.0
 """Blocks that may remain after a stop and the following arming (25 measured; a second stop adds none)."""
 
+_BLOCKS: Final = "sys.getallocatedblocks, from the timing page."
+_ACTIVE: Final = "Mode ACTIVE; a host that stalls one of the processes stops the machine, as intended."
 MEMORY: Final = Section(
     "Memory",
     "Read every few seconds. Growth is the maximum of the second half of the run less the maximum of the first half. "
@@ -46,13 +48,7 @@ MEMORY: Final = Section(
     (
         Metric("controller_growth_kb", "Growth of the controller's resident memory", "kB", "VmRSS.", most=FLAT_KB),
         Metric("guard_growth_kb", "Growth of the guard's resident memory", "kB", "VmRSS.", most=FLAT_KB),
-        Metric(
-            "allocated_blocks_growth",
-            "Growth of allocated memory blocks in the controller",
-            "",
-            "sys.getallocatedblocks, from the timing page.",
-            most=0.0,
-        ),
+        Metric("allocated_blocks_growth", "Growth of allocated memory blocks in the controller", "", _BLOCKS, most=0.0),
         Metric("gc_runs", "Runs of the garbage collector in the controller", "", most=0.0),
         Metric("major_faults", "Major page faults in the controller", "", most=0.0),
     ),
@@ -85,11 +81,7 @@ TIMES: Final = Section(
         Metric("stops", "Stops of the machine", "", "The emulated operator arms it again after each."),
         Metric("stops_unexplained", "Stops without a stall of the host", "", "By the witness of the testbed."),
         Metric(
-            "active_share",
-            "Share of the readings in which the machine moved",
-            "%",
-            "Mode ACTIVE; a host that stalls one of the processes stops the machine, as intended.",
-            least=MIN_ACTIVE_SHARE,
+            "active_share", "Share of the readings in which the machine moved", "%", _ACTIVE, least=MIN_ACTIVE_SHARE
         ),
         Metric("wakeup_p50_us", "Lateness, median", "us"),
         Metric("wakeup_p99_us", "Lateness, p99", "us"),
@@ -106,8 +98,8 @@ CONCLUSION: Final = (
     "and its resident memory grew by {controller_growth_kb}.",
 )
 INTRODUCTION: Final = (
-    "The real controller and guard run on the timing testbed without a pause. "
-    "Nothing may grow, and no frame may be lost."
+    "The real controller and guard run on the timing testbed without a pause. Nothing may grow, and no frame may be "
+    "lost."
 )
 
 
@@ -141,12 +133,12 @@ def run(options: Options, console: Console) -> Result:
         readings.append(read(testbed, time.monotonic() - began))
         counted = testbed.counters()
         counted.subtract(before)
-    event_values = event_metrics([testbed.events])
+    of_events = event_metrics([testbed.events])
     metrics = {
         "minutes": minutes,
         "ticks": float(span.ticks),
         "missed": float(span.missed),
-        **{name: event_values[name] for name in ("stops", "stops_unexplained", "stalls", "stall_max_ms")},
+        **{name: of_events[name] for name in ("stops", "stops_unexplained", "stalls", "stall_max_ms")},
         "active_share": sum(r.mode == "ACTIVE" for r in readings) / len(readings),
         "steal_ms": host_activity.between(first_sample, host_activity.sample()).steal_ms,
         **memory(readings),
@@ -210,11 +202,15 @@ def read(testbed: TimingTestbed, at_s: float) -> Reading:
 def memory(readings: Sequence[Reading]) -> dict[str, float]:
     """Compute the growth between the halves of a run, and counters of the controller's process."""
     half = max(1, len(readings) // 2)
-    early, late = readings[:half], readings[half:]
     first, last = readings[0].facts.process, readings[-1].facts.process
+
+    def growth(name: str) -> float:
+        sizes_kb: list[int] = [getattr(reading, name) for reading in readings]
+        return float(max(sizes_kb[half:]) - max(sizes_kb[:half]))
+
     return {
-        "controller_growth_kb": float(max(r.controller_kb for r in late) - max(r.controller_kb for r in early)),
-        "guard_growth_kb": float(max(r.guard_kb for r in late) - max(r.guard_kb for r in early)),
+        "controller_growth_kb": growth("controller_kb"),
+        "guard_growth_kb": growth("guard_kb"),
         "allocated_blocks_growth": block_growth([r.facts for r in readings]),
         "gc_runs": float(last.gc_runs - first.gc_runs),
         "major_faults": float(last.major_faults - first.major_faults),
@@ -225,23 +221,21 @@ def frames(counted: Counter[str], span: Span) -> dict[str, float]:
     """Count the frames in a run, by bus observer, emulated machine and controller."""
     lost = sum(loss.frames for loss in losses_between(span.begin, span.end))
     names = ("received", "sent", "gaps", "gaps_rig", "damaged", "unanswered", "records_lost")
-    return {
-        **{name: float(counted[name]) for name in names},
-        "frames_lost": float(lost + counted["machine_frames_lost"]),
-    }
+    counts = {name: float(counted[name]) for name in names}
+    return counts | {"frames_lost": float(lost + counted["machine_frames_lost"])}
 
 
 def draw_memory(readings: Sequence[Reading], path: Path) -> None:
     """Plot the growth since the first reading."""
-    minutes = [r.at_s / 60 for r in readings]
     with sheet(path, 2) as axes:
-        for name, colour in (("controller_kb", OIL), ("guard_kb", TIMBER)):
-            values = [getattr(r, name) for r in readings]
-            axes[0].plot(minutes, [v - values[0] for v in values], color=colour, label=name.removesuffix("_kb"))
+        for axis, label, colour, values in (
+            (axes[0], "controller", OIL, [r.controller_kb for r in readings]),
+            (axes[0], "guard", TIMBER, [r.guard_kb for r in readings]),
+            (axes[1], None, OIL, [r.facts.process.allocated_blocks for r in readings]),
+        ):
+            axis.plot([r.at_s / 60 for r in readings], [v - values[0] for v in values], color=colour, label=label)
         axes[0].set_ylabel("resident memory since the start [kB]")
         axes[0].legend()
-        blocks = [r.facts.process.allocated_blocks for r in readings]
-        axes[1].plot(minutes, [b - blocks[0] for b in blocks], color=OIL)
         axes[1].set_ylabel("blocks of the controller since the start")
         for axis in axes:
             axis.set_xlabel("min")

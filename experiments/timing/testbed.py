@@ -17,7 +17,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Final, NamedTuple, Self
+from typing import Any, Final, Self
 
 from can_dbc.bus.factory import VCAN_NAMES
 from can_dbc.messages.envelope import write_key
@@ -71,11 +71,8 @@ class TestbedConfig:
         return 1_000_000_000 // self.rate_hz
 
 
-class Mark(NamedTuple):
-    """The beginning of a `Span`: the controller's timing page, and its instructions so far."""
-
-    page: Timing
-    instructions: int | None
+Mark = tuple[Timing, int | None]
+"""The beginning of a `Span`: the controller's timing page, and its instructions so far."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -280,22 +277,23 @@ class TimingTestbed:
         """Wait for the next timing page that the controller writes; it writes one per second."""
         before_ns = self.timing().facts.written_ns
         if not self.until(lambda: self.timing().facts.written_ns != before_ns, PAGE_S):
-            why = "the controller has stopped writing its timing page"
-            raise CommandFailed("timing-testbed.page-stale", why, ExitCode.SAFETY_STOP)
+            raise CommandFailed(
+                "timing-testbed.page-stale", "the controller has stopped writing its timing page", ExitCode.SAFETY_STOP
+            )
         assert self._last is not None
         return self._last
 
     def mark(self) -> Mark:
         """Begin a span with the next timing page."""
         page = self.fresh_timing()
-        return Mark(page, None if self._counter is None else count(self._counter))
+        return page, None if self._counter is None else count(self._counter)
 
     def since(self, mark: Mark) -> Span:
         """Return the span since a mark, up to the next timing page."""
-        now, begun = self.mark(), mark.instructions
-        between = {name: after - mark.page.durations[name] for name, after in now.page.durations.items()}
-        executed = None if begun is None or now.instructions is None else now.instructions - begun
-        return Span(mark.page.facts, now.page.facts, between, executed)
+        (first, counted), (last, counted_now) = mark, self.mark()
+        between = {name: after - first.durations[name] for name, after in last.durations.items()}
+        executed = None if counted is None or counted_now is None else counted_now - counted
+        return Span(first.facts, last.facts, between, executed)
 
     def until(self, reached: Callable[[], bool], seconds: float, period_s: float = 0.02) -> bool:
         """Check the processes until something is reached; False if it is not within this time."""
@@ -323,8 +321,9 @@ class TimingTestbed:
             return gone
 
         if not self.until(ended, seconds, 0.05):
-            why = f"{name} does not end; see {child.errors}"
-            raise CommandFailed("timing-testbed.helper-hangs", why, ExitCode.CONFIGURATION)
+            raise CommandFailed(
+                "timing-testbed.helper-hangs", f"{name} does not end; see {child.errors}", ExitCode.CONFIGURATION
+            )
         self.end_helper(name)
         return output
 
@@ -332,8 +331,11 @@ class TimingTestbed:
         """Stop a helper that writes its report when it is stopped; raises CommandFailed if it failed."""
         complaint = self.helpers.children[name].complaint
         if code := self.helpers.stop(name, WAIT_S):
-            why = f"{name} failed with exit code {code}: {complaint()}"
-            raise CommandFailed("timing-testbed.helper-failed", why, ExitCode.CONFIGURATION)
+            raise CommandFailed(
+                "timing-testbed.helper-failed",
+                f"{name} failed with exit code {code}: {complaint()}",
+                ExitCode.CONFIGURATION,
+            )
 
     def close(self) -> None:
         """Stop everything, neutral commands first."""

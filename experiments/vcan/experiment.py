@@ -45,18 +45,8 @@ _CLOCK: Final = re.compile(r"^vcan lab: (real|simulated) time: (.*)$", re.MULTIL
 _MODE: Final = re.compile(r"^ *[0-9.]+ s +(STOP|FAULT): (.*)$", re.MULTILINE)
 KINDS: Final = {"demo": "one log into the bunk", "mission": "mission with three logs"}
 CLOCKS: Final = ("real", "simulated", "native")
-SEED_FIGURES: Final = (
-    "done",
-    "stops",
-    "leases_lost",
-    "refused",
-    "missed_ticks",
-    "seconds",
-    "wall_s",
-    "steal_ms",
-    "lost_ms",
-    "longest_ms",
-)
+RUN_FIGURES: Final = ("done", "stops", "leases_lost", "refused", "missed_ticks", "seconds")
+HOST_FIGURES: Final = ("wall_s", "steal_ms", "lost_ms", "longest_ms")
 CONCLUSION: Final = tuple(
     f"{title}: {{{kind}_runs}} runs, {{{kind}_done}} done, {{{kind}_stops}} stops; {{{kind}_real}} in real time, "
     f"{{{kind}_simulated}} in simulated time."
@@ -71,6 +61,9 @@ INTRODUCTION: Final = (
 )
 
 
+_REAL: Final = "In user-mode Linux or natively; simulated only where the host's lost time leaves no other choice."
+
+
 def _metrics(kind: str, title: str) -> Iterator[Metric]:
     yield Metric(f"{kind}_runs", f"Runs: {title}", "", "One seed each, one after the other.")
     yield Metric(f"{kind}_done", f"Done: {title}", "%", "By the plant's physics.", least=1.0)
@@ -80,14 +73,8 @@ def _metrics(kind: str, title: str) -> Iterator[Metric]:
     for clock, clock_text in (("real", "real time"), ("simulated", "simulated time")):
         yield Metric(f"{kind}_{clock}", f"Runs in {clock_text}: {title}", "", "As announced.")
         yield Metric(f"{kind}_{clock}_stops", f"Stops in {clock_text}: {title}", "", "Of these runs alone.")
-    yield Metric(
-        f"{kind}_real_share",
-        f"Share of runs in real time: {title}",
-        "%",
-        "In user-mode Linux or natively; simulated only where the host's lost time leaves no other choice.",
-        least=1.0,
-        clocked=True,
-    )
+    share = f"Share of runs in real time: {title}"
+    yield Metric(f"{kind}_real_share", share, "%", _REAL, least=1.0, clocked=True)
     yield Metric(f"{kind}_wall_s", f"Duration on the host: {title}", "s", "Mean, with the start of every process.")
 
 
@@ -142,7 +129,7 @@ def gather(outcomes: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
             metrics[f"{kind}_{clock}_stops"] = float(sum(o["stops"] for o in chosen))
         metrics[f"{kind}_real_share"] = metrics[f"{kind}_real"] / len(runs)
         for o in runs:
-            metrics |= {f"{kind}_{o['seed']}_{name}": float(o[name]) for name in SEED_FIGURES}
+            metrics |= {f"{kind}_{o['seed']}_{name}": float(o[name]) for name in (*RUN_FIGURES, *HOST_FIGURES)}
             metrics[f"{kind}_{o['seed']}_clock"] = float(CLOCKS.index(o["clock"]))
     runs = list(outcomes.values())
     metrics |= {name: sum(o[name] for o in runs) for name in ("steal_ms", "lost_ms")}
@@ -151,10 +138,9 @@ def gather(outcomes: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
 
 def noisy(outcomes: Mapping[str, Mapping[str, Any]]) -> bool:
     """Tell whether the host took too much: by the witness beside the runs, or the measurement that chose the clock."""
-    wall_ms = sum(o["wall_s"] for o in outcomes.values()) * 1e3
-    lost = sum(o["lost_ms"] for o in outcomes.values()) > MAX_LOST_SHARE * wall_ms
-    long = any(o["longest_ms"] > MAX_LONGEST_MS for o in outcomes.values())
-    return lost or long or any(o["clock"] == "simulated" for o in outcomes.values())
+    runs = outcomes.values()
+    lost = sum(o["lost_ms"] for o in runs) > MAX_LOST_SHARE * 1e3 * sum(o["wall_s"] for o in runs)
+    return lost or any(o["longest_ms"] > MAX_LONGEST_MS or o["clock"] == "simulated" for o in runs)
 
 
 def environment_of(outcomes: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
