@@ -180,10 +180,8 @@ def measure_computer(
 
 
 def _interrupts(cpu: int) -> dict[str, int]:
-    try:
-        return interrupt_counts(Path("/proc/interrupts").read_text(), cpu)
-    except OSError:
-        return {}
+    path = Path("/proc/interrupts")
+    return interrupt_counts(path.read_text(), cpu) if os.access(path, os.R_OK) else {}
 
 
 def disturbances(f: Figures) -> list[str]:
@@ -308,9 +306,7 @@ def without_private(value: Any, words: Iterable[str]) -> Any:
         return [without_private(inner, words) for inner in value]
     if isinstance(value, frozenset | set):
         return sorted(value)
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def data_of(

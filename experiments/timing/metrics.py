@@ -1,9 +1,7 @@
 """Metrics of the timing experiment: their limits, the page that shows them, and what measurement windows say of them.
 
-Metrics that depend on the host's clock are compared with cyclictest in the same windows, and only in those in which
-cyclictest shows a quiet host.  cyclictest wakes once per period of the controller, so a stall of the host that is long
-enough for a missed deadline shows there too.  If too few windows are quiet, or a run is too short, such a metric is
-inconclusive, whatever its value.
+The texts of the page say how a metric is judged.  cyclictest wakes once per period of the controller, so a stall of the
+host that is long enough for a missed deadline shows there too.
 """
 
 from __future__ import annotations
@@ -180,9 +178,8 @@ METRICS: Final = tuple(m for section in SECTIONS for m in section.metrics)
 
 
 QUIET_LONGEST_SHARE: Final = 0.2
-"""Longest lateness of cyclictest in a quiet window, as a share of the period."""
 QUIET_P99_SHARE: Final = 0.05
-"""Lateness of cyclictest at p99 in a quiet window, as a share of the period."""
+"""Lateness of cyclictest in a quiet window, longest and at p99, as a share of the period."""
 QUIET_STEAL_SHARE: Final = 0.005
 """Share of the time of one processor that the hypervisor may take in a quiet window."""
 QUIET_WINDOW_SHARE: Final = 0.5
@@ -284,8 +281,8 @@ def compared_windows(windows: Sequence[MeasurementWindow]) -> tuple[list[Measure
 def quietest_windows(windows: Sequence[MeasurementWindow]) -> list[MeasurementWindow]:
     """Select the quietest quarter, at least one, by the sleep loop's processor time: our own times choose nothing.
 
-    The loop does the same in every cycle, on the same processor in the same seconds.  What makes it dear, other
-    machines' work in the shared caches, makes a tick dear; cyclictest's lateness does not tell these windows apart.
+    What makes that loop dear, other machines' work in the shared caches, makes a tick dear; cyclictest's lateness does
+    not tell these windows apart.
     """
     ordered = sorted(windows, key=lambda w: w.plain_cpu_us)
     return ordered[: max(1, math.ceil(COST_WINDOW_SHARE * len(ordered)))]

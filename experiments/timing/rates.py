@@ -194,7 +194,7 @@ def loads(points: Sequence[RatePoint], machine: str) -> tuple[list[float], list[
 
 def gather(points: Sequence[RatePoint], cranes: Sequence[CranePoint]) -> dict[str, float]:
     """Compute all metrics."""
-    fast = next(p for p in points if p.machine == FORWARDER and p.rate_hz == max(q.rate_hz for q in points))
+    fast = max((p for p in points if p.machine == FORWARDER), key=lambda p: p.rate_hz)
     metrics = {
         **{f"forwarder1k_{name}": value for name, value in fast.figures.items()},
         **event_metrics([p.events for p in points]),

@@ -19,13 +19,13 @@ import socket
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
 from can_dbc.bus.base import Bus
 from can_dbc.bus.factory import open_bus
-from can_dbc.dbc.codec import Database, load
+from can_dbc.dbc.codec import load
 from can_dbc.frame import Frame
 from can_dbc.messages import operator_link
 from can_dbc.messages.crane import CraneSetpoint, GrappleCommand, Knot, StateReport
@@ -85,8 +85,9 @@ class Continuity:
     consecutive, or with a wrong CRC.
     """
 
-    def __init__(self, databases: Iterable[Database]) -> None:
-        every = [m for database in databases for m in database.messages.values()]
+    def __init__(self, profile: Profile) -> None:
+        names = ("crane", "machine") if profile.machine_bus else ("crane",)
+        every = [m for name in names for m in load(name).messages.values()]
         self._checkers = {m.key: Checker(m.data_ids) for m in every if m.data_ids}
         self.frames: Counter[int] = Counter()
         self.gaps = self.damaged = 0
@@ -104,22 +105,16 @@ class Continuity:
             self.gaps += 1
 
 
-def databases(profile: Profile) -> list[Database]:
-    """Load the databases that define the protected frames of a machine."""
-    return [load("crane"), *([load("machine")] if profile.machine_bus else [])]
-
-
 class BusObserver:
     """Tick records in, totals out; pure."""
 
     def __init__(self, profile: Profile, period_ns: int) -> None:
         self._period_ns = period_ns
         self._last: TickRecord | None = None
-        known = databases(profile)
-        self.received, self.sent = Continuity(known), Continuity(known)
+        self.received, self.sent = Continuity(profile), Continuity(profile)
         specs = [s.encoder for s in profile.joints.values() if s.encoder]
         specs += [profile.carrier.articulation_encoder] if profile.carrier else []
-        self._encoders = [known[0].message(spec.message).key for spec in specs]
+        self._encoders = [load("crane").message(spec.message).key for spec in specs]
         self._first: dict[int, int] = {}
         self.records = self.lost = self.unreadable = 0
 
@@ -196,8 +191,7 @@ class EmulatedMachine(LiveMachine):
             self.stop()
 
     def _totals(self) -> dict[str, float]:
-        seen = {"gaps": self._continuity.gaps, "damaged": self._continuity.damaged}
-        return self.report() | seen
+        return self.report() | {"gaps": self._continuity.gaps, "damaged": self._continuity.damaged}
 
 
 def emulate(profile: Profile, addresses: Sequence[str], cycle_ns: int) -> None:
@@ -207,7 +201,7 @@ def emulate(profile: Profile, addresses: Sequence[str], cycle_ns: int) -> None:
         buses = {}
         for name, _, address in (text.partition("=") for text in addresses):
             buses[name] = stack.enter_context(open_bus(address, tx_queue=TX_QUEUE_FRAMES, participant="rig"))
-        live = EmulatedMachine(machine, buses, Continuity(databases(profile)))
+        live = EmulatedMachine(machine, buses, Continuity(profile))
         live.ended = announce_ready()
         live.run()
 

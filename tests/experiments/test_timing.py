@@ -34,6 +34,7 @@ from experiments.timing.metrics import (
 )
 from experiments.timing.stand_ins import Continuity
 from hil.tick import instructions
+from machine.loading.profile_file import load_profile
 from machine.status.reasons import Reason
 
 PERIOD_NS = 5_000_000
@@ -335,7 +336,7 @@ def test_blocks_that_come_and_go_are_no_growth():
 def test_a_lost_frame_is_a_gap_in_the_counter():
     database = load("crane")
     codec = database.message("ValveCmdA")
-    sender, seen = Sender(codec.data_ids), Continuity([database])
+    sender, seen = Sender(codec.data_ids), Continuity(load_profile("palms_471"))
     frames = [sender.protect(codec.encode(*(0 for _ in codec.signals))) for _ in range(20)]
     for data in frames[:5] + frames[6:]:
         seen.add(codec.key, data)
@@ -347,7 +348,7 @@ def test_a_lost_frame_is_a_gap_in_the_counter():
 def test_counters_of_different_messages_are_kept_apart():
     database = load("crane")
     a, b = database.message("ValveCmdA"), database.message("ValveCmdB")
-    seen = Continuity([database])
+    seen = Continuity(load_profile("palms_471"))
     senders = {c.key: Sender(c.data_ids, start) for c, start in ((a, 3), (b, 9))}
     for _ in range(40):
         for codec in (a, b):
