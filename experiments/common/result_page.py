@@ -12,7 +12,6 @@ import shutil
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
-from itertools import groupby
 from pathlib import Path
 from typing import Final
 
@@ -27,6 +26,8 @@ from experiments.common.standing import judge, marked
 MAX_TITLES: Final = 4
 """Of metrics that are measured alike, on one line."""
 _FIELD: Final = re.compile(r"\{(paper:)?([^{}]+)\}")
+_RELATIVE: Final = re.compile("The (same|other)|As above|Half of")
+"""Begins what tells how a metric is measured by the line before it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,13 +112,32 @@ def markdown(result: Result, page: Page) -> str:
 
 
 def _measured(metrics: Sequence[Metric]) -> list[str]:
-    """Tell how the metrics are measured; neighbours that are measured alike share a line."""
-    lines = []
-    for how, group in groupby(metrics, lambda m: m.how):
-        titles = [f"*{m.title}*" for m in group]
-        title_list = "; ".join(titles) if len(titles) <= MAX_TITLES else f"{titles[0]} to {titles[-1]}"
-        lines += [f"- {title_list}: {how}"] if how else []
+    """Tell how the metrics are measured.  Those that are measured alike share a line, also if others stand between."""
+    alike: list[list[Metric]] = []
+    for m in metrics:
+        known = alike[-1:] if _RELATIVE.match(m.how) else alike
+        group = next((group for group in known if group[0].how == m.how), None)
+        if group is None:
+            alike.append([m])
+        else:
+            group.append(m)
+    lines = [f"- {_titles(group, metrics)}: {group[0].how}" for group in alike if group[0].how]
     return ["", "How each is measured:", "", *lines, ""] if lines else [""] if metrics else []
+
+
+def _titles(group: Sequence[Metric], metrics: Sequence[Metric]) -> str:
+    """List a few titles; of many, say what they share before or after their colon, or name the first and the last."""
+    titles = [m.title for m in group]
+    if len(titles) <= MAX_TITLES:
+        return "; ".join(f"*{title}*" for title in titles)
+    before, _, after = map(set, zip(*(title.partition(": ") for title in titles), strict=True))
+    if len(before) == 1:
+        return f"*{before.pop()}: ...*"
+    if len(after) == 1 and after != {""}:
+        return f"*...: {after.pop()}*"
+    begin = metrics.index(group[0])
+    neighbours = list(metrics[begin : begin + len(group)]) == list(group)
+    return f"*{titles[0]}* to *{titles[-1]}*" if neighbours else f"*{titles[0]}* and {len(titles) - 1} more"
 
 
 def conclusion(result: Result, page: Page) -> str:
@@ -170,8 +190,8 @@ def _setting(result: Result) -> str:
     e = result.environment
     drawn = " (sealed: drawn from the commit)" if result.seed == sealed_seed(result.commit, result.experiment) else ""
     return (
-        f"Profile `{result.profile}`, ground truth `{e.get('truth', '')}`, seed {result.seed}{drawn}, {result.trials} "
-        f"trials of each kind, commit `{result.commit}`. "
+        f"Profile `{result.profile}`, ground truth `{e.get('truth', '')}`, seed {result.seed}{drawn}, "
+        f"{result.trials} {'trial' if result.trials == 1 else 'trials'}, commit `{result.commit}`. "
         f"Host: {e['processor']}, {e['cpus']} cores, {e['machine']}, Python "
         f"{e['python']}, pybullet {e['pybullet']}, numba {e['numba']}."
     )

@@ -168,10 +168,11 @@ SECTIONS: Final = (
     ),
     Section(
         "Contribution of perception and planner",
-        "Every source of poses with every planner on the same scenes. A planner knows the plant's ground truth only "
-        "with the true poses. Paper A's perception is read as a practitioner would: principal axis without outliers, "
-        "mean width of the mask, trimmed ends, nothing that hangs. Its network's predictions are averaged over eight "
-        "places of the virtual camera, which the paper describes (II-C) and did not use.",
+        "Every source of poses with every planner; those that one run measures get the same scenes. A planner knows "
+        "the plant's ground truth only with the true poses. Paper A's perception is read as a practitioner would: "
+        "principal axis without outliers, mean width of the mask, trimmed ends, nothing that hangs. Its network's "
+        "predictions are averaged over eight places of the virtual camera, which the paper describes (II-C) and did "
+        "not use.",
         ABLATION,
     ),
 )

@@ -17,6 +17,7 @@ from experiments.common.overview import read
 from experiments.common.pool import Checkpoint, Job
 from experiments.common.registry import Options
 from experiments.common.result import ROOT, Metric, Result, evaluate, limits_of, rate, wilson
+from experiments.common.result_page import Page, Section, markdown
 from experiments.common.trials import LOCKSTEP_SOURCES, checkpoint
 from experiments.common.workers import Workers
 from experiments.plant.runs import ringing
@@ -189,6 +190,19 @@ def test_a_saved_result_is_flat_without_nan_and_tells_never_from_not_measured(tm
     assert {"experiment", "commit", "profile", "seed", "trials", "paper", "environment"} <= document.keys()
     metrics = read(path).metrics
     assert metrics["speed"] == math.inf and math.isnan(metrics["broken"]) and metrics["share"] == 0.5
+
+
+def test_metrics_that_are_measured_alike_share_a_line_unless_it_refers_to_the_one_before():
+    how = {"a: x": "By eye.", "a: y": "The same eye.", "b: x": "By eye.", "b: z": "By ear.", "b: y": "The same eye."}
+    metrics = tuple(Metric(title, title, "", text) for title, text in how.items())
+    page = markdown(made(dict.fromkeys(how, 1.0)), Page("Thing", (), "", (Section("All", "", metrics),)))
+    listed = [line for line in page.splitlines() if line.startswith("- ")]
+    assert listed == [
+        "- *a: x*; *b: x*: By eye.",
+        "- *a: y*: The same eye.",
+        "- *b: z*: By ear.",
+        "- *b: y*: The same eye.",
+    ]
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", "{}", '{"metrics": [1]}', '{"metrics": {"speed": [1]}}'])
