@@ -87,6 +87,8 @@ class StopRecorder:
             self._finish_oldest()
 
     def _begin(self, stop: Stop, now_ns: int) -> None:
+        if self._on_stop is not None:
+            self._on_stop(stop, self.files.directory / _name(stop))
         try:
             file = self.files.begin(stop, self._manifest)
         except OSError:
@@ -100,8 +102,6 @@ class StopRecorder:
             file.commit()
         except OSError:
             self._give_up(entry)
-        if self._on_stop is not None:
-            self._on_stop(stop, file.path)
         while len(self._open) > MAX_OPEN:
             self._finish_oldest()
 

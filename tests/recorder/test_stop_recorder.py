@@ -230,6 +230,14 @@ def test_a_directory_that_cannot_be_made_costs_the_stops_only(tmp_path: Path) ->
     assert bench.recorders[0].lost == 1 and is_complete(tmp_path / "run" / "run.mcap")
 
 
+def test_a_stop_is_announced_although_its_file_cannot_be_made(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("in the way")
+    told: list[str] = []
+    where = {"stops": tmp_path / "file" / "stops", "on_stop": lambda stop, path: told.append(stop.code)}
+    run_to_a_stop(tmp_path / "run", before=20, after=20, **where).close()
+    assert told == ["ENCODER_LOST"]
+
+
 def test_a_directory_that_is_removed_costs_the_stop_only(tmp_path: Path) -> None:
     bench = run_to_a_stop(tmp_path, before=20, after=20)
     shutil.rmtree(tmp_path / "stops")
