@@ -80,13 +80,23 @@ def _trim_line(path: Path) -> None:
         tail = min(size, 256)
         file.seek(-tail, 2)
         end = file.read().rfind(b"\n") + 1
-        if 0 < end < tail:
+        if end < tail and (end or tail == size):
             file.truncate(size - tail + end)
 
 
 def rewrite(path: Path) -> Recovered:
     """Rewrite an unfinished MCAP file with an index, up to its last complete chunk; raises OSError."""
     new = path.with_suffix(".recovering")
+    try:
+        messages = _copy(path, new)
+        os.replace(new, path)
+    finally:
+        new.unlink(missing_ok=True)
+    return Recovered(path, messages)
+
+
+def _copy(path: Path, new: Path) -> int:
+    """Write the valid part of an MCAP file into ``new``; returns its number of messages; raises OSError."""
     messages = 0
     with new.open("wb") as file:
         writer = Writer(file)
@@ -106,8 +116,7 @@ def rewrite(path: Path) -> Recovered:
         writer.finish()  # type: ignore[no-untyped-call]
         file.flush()
         os.fsync(file.fileno())
-    os.replace(new, path)
-    return Recovered(path, messages)
+    return messages
 
 
 # -- Reads an MCAP file from front to back and stops, without an error, where its valid part ends.
