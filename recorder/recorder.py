@@ -98,6 +98,8 @@ def json_schema(codec: MessageCodec) -> bytes:
 STOPS_NAME: Final = "stops"
 CHUNK_NS: Final = 200_000_000
 SEGMENT_BYTES: Final = 512 * 2**20
+END_NS: Final = 2**32 * 10**9
+"""Times from here on fit into no recording: those of Foxglove's messages have 32 bits of seconds (year 2106)."""
 REPORT: Final = "/controller/report"
 VEHICLE: Final = "/controller/vehicle"
 TIMING: Final = "/timing"
@@ -131,7 +133,7 @@ class Recorder:
         self.dropped = 0
         """Records lost because they could not be written."""
         self.refused = 0
-        """Reports and tick records that were invalid."""
+        """Reports, pictures and tick records that were invalid, or of a time that fits into no recording."""
         self.other_key = False
         """A refused datagram was a state report with an authenticator of another key, or there is no key here."""
         self._directory = directory
@@ -209,6 +211,8 @@ class Recorder:
             self.other_key = self.other_key or _is_signed_report(datagram)
             return
         stamp_ns, time_ns = report.stamp_ns, report.stamp_ns + self._offset_ns
+        if not self._holds(stamp_ns):
+            return
         self._at(stamp_ns)
         self._add(topic, stamp_ns, _JSON.encode(report))
         on = self._topics.on_position if isinstance(report, VehicleReport) else self._topics.on_state
@@ -220,8 +224,9 @@ class Recorder:
             _, stamp_ns, mission = decode_mission(datagram, self._key)
         except DatagramRefused:
             return _is_grasp(datagram, self._key)
-        self._at(stamp_ns)
-        self._add_drawing(self._topics.on_mission(mission, stamp_ns + self._offset_ns), stamp_ns)
+        if self._holds(stamp_ns):
+            self._at(stamp_ns)
+            self._add_drawing(self._topics.on_mission(mission, stamp_ns + self._offset_ns), stamp_ns)
         return True
 
     def on_picture(self, datagram: bytes) -> None:
@@ -230,7 +235,7 @@ class Recorder:
             facts, jpeg = decode_picture(datagram)
         except InputRefused:
             return
-        if jpeg:
+        if jpeg and self._holds(facts.measured_ns):
             self._at(facts.measured_ns)
             messages = self._topics.on_picture(facts.camera, jpeg, facts.measured_ns + self._offset_ns)
             self._add_drawing(messages, facts.measured_ns)
@@ -256,8 +261,8 @@ class Recorder:
             if self._segment is None:
                 self._open_segment()
             elif self._segment.commit() > SEGMENT_BYTES:
-                segment, self._segment = self._segment, None
-                segment.finish()
+                self._segment.finish()
+                self._segment = None
                 self._open_segment()
         except OSError:
             self._abandon()
@@ -278,6 +283,12 @@ class Recorder:
             manifests.write(self._directory, complete)
         except OSError:
             self.dropped += 1
+
+    def _holds(self, stamp_ns: int) -> bool:
+        """Tell whether a recording can hold this time, which another process says; count what it cannot as refused."""
+        holds = 0 <= stamp_ns < END_NS - self._offset_ns
+        self.refused += not holds
+        return holds
 
     def _at(self, stamp_ns: int) -> None:
         """End the chunk before a record that would make it longer than CHUNK_NS, in any order of records."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import errno
 import json
 import os
@@ -17,8 +18,9 @@ from mcap.reader import make_reader
 
 from can_dbc.bus.factory import open_bus
 from can_dbc.frame import Frame
-from can_dbc.messages.datagrams import encode
+from can_dbc.messages.datagrams import decode, encode
 from can_dbc.messages.envelope import signed, write_key
+from can_dbc.messages.picture import JPEG_START, PictureFacts, encode_picture
 from can_dbc.messages.record_ring import RingReader
 from can_dbc.timing.page import TimingWriter
 from recorder import manifest as manifests
@@ -192,6 +194,17 @@ def test_damaged_datagrams_are_counted(recorder, tmp_path):
     assert recorder.refused == 3
 
 
+@pytest.mark.parametrize("live", [False, True])
+@pytest.mark.parametrize("stamp_ns", [2**64 - 1, 2**63, 2**32 * 10**9])
+def test_a_time_that_no_recording_can_hold_is_counted_and_ends_nothing(stamp_ns, live, tmp_path):
+    recorder = Recorder(tmp_path, PROFILE, manifest(live=live))
+    recorder.on_report(encode(dataclasses.replace(decode(report(0)), stamp_ns=stamp_ns)))
+    recorder.on_picture(encode_picture(PictureFacts(1, "stick", stamp_ns, "", 2, 2), JPEG_START))
+    recorder.on_report(report(0))
+    recorder.close()
+    assert recorder.refused == 2 and len(by_topic(tmp_path / "run.mcap")["/controller/report"]) == 1
+
+
 def test_a_directory_with_a_recording_is_refused_and_unchanged(run):
     before = (run / "run.mcap").read_bytes()
     with pytest.raises(InputRefused, check=coded("recording.exists")):
@@ -257,6 +270,33 @@ def test_full_disk_while_running_costs_counted_records_and_nothing_else(recorder
     assert kept == [tick(k) for k in (*range(100), *range(200, 300))]
     assert is_complete(second)
     assert len(list(can.CanutilsLogReader(tmp_path / "crane0.log"))) == 4 * 200
+
+
+def test_a_file_that_a_full_disk_keeps_from_its_index_is_closed(recorder, monkeypatch):
+    monkeypatch.setattr("recorder.recorder.SEGMENT_BYTES", 1)
+    fd = recorder._segment._file.fileno()
+
+    def full(self):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(segment.Segment, "finish", full)
+    feed(recorder, range(10))
+    recorder.flush(START_NS + 10 * T_NS)
+    with pytest.raises(OSError, match=os.strerror(errno.EBADF)):
+        os.fstat(fd)
+
+
+def test_a_repair_that_fails_leaves_no_second_file_on_the_full_disk(run, tmp_path, monkeypatch):
+    (tmp_path / "run.mcap").write_bytes(cut := (run / "run.mcap").read_bytes()[:-1])
+
+    def full(_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr("recorder.recover.os.fsync", full)
+    with pytest.raises(OSError, match=os.strerror(errno.ENOSPC)):
+        recover(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["run.mcap"]
+    assert (tmp_path / "run.mcap").read_bytes() == cut
 
 
 def test_scan_returns_only_the_requested_topics(run):
@@ -350,6 +390,14 @@ def test_an_unfinished_line_of_the_candump_file_is_removed(run, tmp_path, name, 
     log.write_bytes(lines + unfinished * b"x")
     recover(tmp_path)
     assert log.read_bytes() == lines + kept * b"x"
+
+
+def test_a_candump_file_that_holds_only_the_beginning_of_a_line_is_empty_again(run, tmp_path):
+    (tmp_path / "manifest.json").write_bytes((run / "manifest.json").read_bytes())
+    (tmp_path / "run.mcap").write_bytes((run / "run.mcap").read_bytes()[:-1])
+    (tmp_path / "crane0.log").write_bytes(b"(7.000000) cra")
+    recover(tmp_path)
+    assert (tmp_path / "crane0.log").read_bytes() == b""
 
 
 def test_a_file_of_another_kind_is_refused_with_its_name(tmp_path):
