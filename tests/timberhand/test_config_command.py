@@ -131,3 +131,23 @@ def test_migrate_keeps_values_takes_this_release_s_words_and_leaves_the_old_file
     assert RUNNER.invoke(app, ["config", "migrate", str(conf)]).exit_code == 0
     assert (conf.read_text(), (tmp_path / "timberhand.conf.old").read_text()) == (new, old)
     assert problems_of(conf.read_text(), TEXT) == []
+
+
+@pytest.mark.parametrize("line", ["PROFILE = aoro_fc8", "AUTONOMY_OPTIONS=--mission a \\\n  --order-port 24705"])
+def test_migrate_refuses_a_file_whose_lines_it_would_lose(line: str, tmp_path: Path) -> None:
+    """systemd reads blanks around the sign and continued lines, so the machine may run with them."""
+    conf = tmp_path / "timberhand.conf"
+    conf.write_text(f"CRANE_BITRATE=500000\n{line}\n")
+    refused = RUNNER.invoke(app, ["config", "migrate", str(conf)]).exception
+    assert isinstance(refused, TimberhandError) and refused.code == "config.no-setting"
+    assert f"{conf}:{1 + len(line.splitlines())}: " in str(refused)
+    assert [path.name for path in tmp_path.iterdir()] == [conf.name] and line in conf.read_text()
+
+
+def test_show_tells_the_settings_in_force_also_those_that_the_file_lacks(tmp_path: Path) -> None:
+    conf = tmp_path / "short.conf"
+    conf.write_text("CRANE_BITRATE=500000\n")
+    shown = json.loads(RUNNER.invoke(app, ["config", "show", str(conf), "--json"]).stdout)
+    assert shown["machine"].startswith("palms_471")
+    assert shown["settings"].keys() == parse(TEXT, []).keys()
+    assert [name for name, found in shown["settings"].items() if found["changed"]] == ["CRANE_BITRATE"]

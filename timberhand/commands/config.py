@@ -68,7 +68,7 @@ def show(file: File = None, as_json: JsonOption = False) -> None:
 
     path = file or INSTALLED
     settings = effective(path)
-    profile = settings["PROFILE"][0].value if "PROFILE" in settings else ""
+    profile = settings["PROFILE"][0].value
     machine, files = profile_word(profile), list(parts(path, profile))
     if as_json:
         values = {name: {"value": s.value, "changed": changed} for name, (s, changed) in settings.items()}
@@ -115,7 +115,8 @@ def migrate(
 ) -> None:
     """Bring a settings file of a former release to this one: its values, in this release's file with its words.
 
-    The old file stays beside it as FILE.old.
+    The old file stays beside it as FILE.old. A line that is no setting is
+    refused: what it meant would be lost.
 
     [bold]Examples[/bold]
 
@@ -123,10 +124,15 @@ def migrate(
 
       timberhand config migrate old.conf --dry-run
     """
-    from timberhand.configuration.settings_file import INSTALLED, SHIPPED, migrated, read
+    from timberhand.configuration.settings_file import INSTALLED, SHIPPED, Problem, migrated, parse, read
 
     path = file or INSTALLED
     text = read(path)
+    problems: list[Problem] = []
+    parse(text, problems)
+    if problems:
+        sentence = f"{path}:{problems[0].line}: {problems[0].sentence}; then migrate again"
+        raise CommandFailed("config.no-setting", sentence)
     new, notes = migrated(text, read(SHIPPED))
     for note in notes:
         print(note, file=sys.stderr)

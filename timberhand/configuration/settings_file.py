@@ -145,9 +145,10 @@ def profile_word(profile: str) -> str:
 
 
 def effective(path: Path) -> dict[str, tuple[Setting, bool]]:
-    """Map name -> setting, and whether it differs from the shipped one."""
+    """Map name -> setting in force, and whether it differs from the shipped one, which stands in for one that lacks."""
     shipped, own_settings = parse(read(SHIPPED), []), parse(read(path), [])
-    return {name: (s, name not in shipped or shipped[name].value != s.value) for name, s in own_settings.items()}
+    in_force = shipped | own_settings
+    return {name: (s, name not in shipped or shipped[name].value != s.value) for name, s in in_force.items()}
 
 
 def differences(first: Path, second: Path) -> list[tuple[str, Any, Any]]:
