@@ -97,6 +97,8 @@ def make(wheel: Path, private: Path, out: Path, find_links: Path | None, lock: L
         sign(folder / SUMS, private)
         archive = out / f"{folder.name}.tar"
         _pack(folder, archive)
+    except zipfile.BadZipFile as error:
+        raise CommandFailed("bundle.no-wheel", f"{wheel} is damaged: {error}; make it again: make wheel") from None
     except OSError as error:
         sentence = f"the bundle cannot be made in {out}: {error.strerror}; make room there, or name another --out"
         raise CommandFailed("bundle.not-written", sentence) from None

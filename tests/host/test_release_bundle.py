@@ -162,6 +162,10 @@ def test_what_is_no_wheel_and_what_is_no_bundle_is_one_sentence(tmp_path: Path) 
     for name in ("msgspec-1.0-py3-none-any.whl", "timberhand.zip", "timberhand-1.0-py3-none-any.whl"):
         with pytest.raises(CommandFailed, check=coded("bundle.no-wheel")):
             bundles.make(tmp_path / name, private, tmp_path / "out", None, None)
+    half = small_wheel(tmp_path, "1.0")
+    half.write_bytes(half.read_bytes()[:-30])
+    with pytest.raises(CommandFailed, check=coded("bundle.no-wheel")):
+        bundles.make(half, private, tmp_path / "out", None, None)
     (tmp_path / "text").write_text("no tar file")
     with pytest.raises(CommandFailed, check=coded("bundle.no-bundle")):
         bundles.unpack(tmp_path / "text", tmp_path / "nothing")
