@@ -74,9 +74,11 @@ def apply(folder: Path, public: Path, place: Path = PLACE) -> Path:
             return place / LINK / PROFILE
         contents = {name: (folder / name).read_bytes() for name in (*names, SUMS, signature_path(Path(SUMS)).name)}
         shutil.rmtree(fresh, ignore_errors=True)
-        fresh.mkdir(mode=0o755)
+        fresh.mkdir()
+        fresh.chmod(0o755)  # whatever the umask: the services read them as users of their own
         for name, content in contents.items():
             (fresh / name).write_bytes(content)
+            (fresh / name).chmod(0o644)
         os.sync()
         check(fresh, public)  # what lies there, not what it was copied from
         shutil.rmtree(slot, ignore_errors=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import shutil
+import stat
 import zipfile
 from pathlib import Path
 
@@ -141,6 +142,20 @@ def test_files_that_lie_in_a_place_already_are_used_there(
     etc, _, public = applied
     assert f"# {title}" in machine_files.apply(etc / name, public, etc).read_text()
     assert f"# {other}" in machine_files.revert(public, etc).read_text()
+
+
+def test_the_services_may_read_machine_files_whatever_root_s_umask(
+    applied: tuple[Path, Path, Path], tmp_path: Path
+) -> None:
+    etc, private, public = applied
+    third = machine(tmp_path / "third", private, "third")
+    before = os.umask(0o077)
+    try:
+        profile = machine_files.apply(third, public, etc)
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE(profile.parent.stat().st_mode) == 0o755
+    assert {stat.S_IMODE(path.stat().st_mode) for path in profile.parent.iterdir()} == {0o644}
 
 
 def test_a_full_disk_leaves_the_files_in_use_and_the_former_ones(
