@@ -305,7 +305,7 @@ allow_program() {
 pin() {
     if [ -z "$cpu" ]; then
         [ -z "$rooted" ] && [ ! -e "$conf" ] || return 0
-        read -r isolated <"$processors/isolated" || return 0
+        read -r isolated <"$processors/isolated" && [ "$isolated" ] || return 0
         cpu=${isolated##*[-,]}
         say "the controller gets processor $cpu, which the kernel isolates; another one: --cpu N"
     fi

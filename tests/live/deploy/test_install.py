@@ -209,7 +209,8 @@ def test_the_first_installation_takes_a_processor_that_the_kernel_isolates(
     command = ["sh", script, "--dry-run", "--python", python, "--wheel", wheel]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert pinned_by(done.stdout) == pinned
+    assert pinned_by(done.stdout) == pinned and ("50-processor" in done.stdout) == bool(pinned)
+    assert ("isolates" in done.stderr) == bool(pinned)
 
 
 def test_a_bundle_for_another_python_is_refused_in_one_sentence(bundle: tuple[Path, Path, Path]) -> None:
