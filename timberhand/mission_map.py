@@ -47,10 +47,11 @@ def draw(mission: ForwardingMission, review: Review | None, path: Path) -> None:
             _log(axis, log, at)
         for landing, at in zip(mission.landings, landings, strict=True):
             axis.plot(*at, marker="s", ms=9, mfc="white", mec=MOSS, mew=2.0, ls="none", zorder=6)
-            axis.annotate(landing.name or "landing", at, (8, 6), textcoords="offset points", color=MOSS, weight="bold")
+            words = {"color": MOSS, "weight": "bold", "parse_math": False}
+            axis.annotate(landing.name or "landing", at, (8, 6), textcoords="offset points", **words)
         origin = f"{abs(frame.latitude_deg):.6f}° {'N' if frame.latitude_deg >= 0 else 'S'}, "
         origin += f"{abs(frame.longitude_deg):.6f}° {'E' if frame.longitude_deg >= 0 else 'W'}"
-        axis.set_title(mission.name or "mission")
+        axis.set_title(mission.name or "mission", parse_math=False)
         axis.set_xlabel(f"east of {origin}, m")
         axis.set_ylabel("north, m")
         _legend(axis, mission, review)

@@ -116,3 +116,13 @@ def test_show_draws_everything(tmp_path: Path) -> None:
         inks = {color for _, color in picture.convert("RGB").getcolors(1 << 20)}
     assert {OIL, MOSS, RUST, TIMBER} <= {f"#{r:02x}{g:02x}{b:02x}" for r, g, b in inks}  # route, fence, keep-out, logs
     assert run("show", logs, "--png", tmp_path / "logs.png").exit_code == 0, "logs alone"
+
+
+@pytest.mark.parametrize("name", ["a $\\x$ b", "50 $^$"])
+def test_names_are_drawn_as_they_are(name: str, tmp_path: Path) -> None:
+    mission = json.loads(Path(PAPER_B).read_text())
+    mission["timberhand"]["name"] = name
+    log = next(f for f in mission["features"] if f["properties"]["role"] == "log")
+    mission["features"].append(log | {"properties": {"role": "landing", "name": name}})
+    (tmp_path / "priced.geojson").write_text(json.dumps(mission))
+    assert run("show", tmp_path / "priced.geojson", "--png", tmp_path / "a.png").exit_code == 0
