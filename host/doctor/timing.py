@@ -19,6 +19,7 @@ MIN_RT_SHARE = 0.9
 SAMPLE_POINTS = (0.75, 0.9)
 """Share of the bit time at which a node may sample: CiA 301 asks for 87.5 %, SAE J1939-11 for 80 to 87.5 %."""
 FAST_CLOCKS = ("tsc", "kvm-clock", "arch_sys_counter", "timer", "hyperv_clocksource_tsc_page")
+CAN_UP = "sudo systemctl restart timberhand-can@crane0 timberhand-can@mach0  # the interfaces that the settings name"
 SETTINGS = "sudo nano /etc/timberhand/timberhand.conf"
 LIMITS = "sudo tee -a /etc/security/limits.d/timberhand.conf  # then log in again"
 TUNE = "sudo sh deploy/tune.sh --apply"
@@ -247,7 +248,7 @@ def _can_interfaces(facts: Facts) -> Iterator[Finding]:
 def _link(link: CanLink) -> Finding:
     topic, name, rate, percent = f"CAN {link.name}", link.name, f"{link.bitrate} bit/s", 100.0 * link.sample_point
     if not link.up:
-        command = f"sudo ip link set {name} up" if link.virtual else f"sudo systemctl start timberhand-can@{name}"
+        command = f"sudo ip link set {name} up" if link.virtual else CAN_UP
         return Finding(topic, CHANGE, "the interface is down", "a working bus", (command,))
     if link.virtual:
         return fine(topic, "virtual and up")
@@ -271,7 +272,7 @@ def _link(link: CanLink) -> Finding:
         ADVICE,
         f"{rate}; no automatic restart after bus-off",
         "the bus restarts after 100 ms; the controller latches its fault before that",
-        f"sudo systemctl restart timberhand-can@{name}",
+        CAN_UP,
     )
 
 

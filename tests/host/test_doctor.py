@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -220,6 +221,15 @@ def test_the_state_of_a_can_interface(tree: Tree, change: dict[str, Any], severi
     link: CanLink = replace(facts.links[0], **change)
     found = of(replace(facts, links=(link,)), "CAN crane0")
     assert (found.severity, sentence in found.sentence) == (severity, True)
+
+
+def test_an_interface_of_any_name_comes_up_by_the_services_of_the_buses(tree: Tree) -> None:
+    """`deploy/system/can-up` knows the buses, and by the settings their interfaces."""
+    facts = tree()
+    for change in ({"up": False}, {"restart_ms": 0}):
+        link = replace(facts.links[0], name="can0", **change)
+        (command,) = of(replace(facts, links=(link,)), "CAN can0").commands
+        assert set(re.findall(r"timberhand-can@(\w+)", command)) == {"crane0", "mach0"}
 
 
 def test_the_greatest_gain_comes_first(tree: Tree) -> None:
