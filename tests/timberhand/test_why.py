@@ -18,16 +18,19 @@ import pytest
 from rich.console import Console
 from typer.testing import CliRunner
 
+from can_dbc.dbc.codec import load
+from can_dbc.frame import Frame
 from can_dbc.messages.crane import OperatorAction
 from can_dbc.messages.envelope import signed
-from can_dbc.messages.tick_record import TickRecord, decode
+from can_dbc.messages.tick_record import BusReading, TickRecord, decode
 from controller.process.tick_recording import record
 from host.exit_codes import CommandFailed, ExitCode
 from machine.status.explanation import sentence_of
 from machine.status.faults import FAULTS
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
-from recorder.stop_recorder import files_in
+from recorder.segment import Segment
+from recorder.stop_recorder import TOPIC, files_in
 from tests.codes import coded, numbers_in
 from tests.controller.bench import Bench
 from tests.recorder.stopped_run import RecordedBench, recorder_in, run_with_a_stop
@@ -274,3 +277,24 @@ def test_why_tells_a_failure_where_there_is_no_stop(tmp_path: Path, monkeypatch:
     assert done.exit_code == 0 and GUARD in done.stdout
     assert "1970-01-02 00:00:00" in done.stdout and 3 in numbers_in(done.stdout) and "journalctl -u" in done.stdout
     assert json.loads(CliRunner().invoke(app, ["why", "--json"]).stdout)["failure"]["times"] == 3
+
+
+def test_a_gnss_receiver_that_falls_silent_is_on_the_timeline() -> None:
+    codec, quiet = load("gnss").message("PositionRapidUpdate"), BusReading()
+
+    def tick(k: int) -> TickRecord:
+        now_ns = k * 5_000_000
+        position = [Frame(now_ns, codec.key, bytes(codec.length))] if k % 20 == 0 and k <= 200 else []
+        return TickRecord(now_ns, 0, 0, 0, quiet, quiet, (), position, (), (), (), b"")
+
+    (event,) = events_of(tuple(map(tick, range(400))), 1_800_000_000)
+    assert event.at_s == pytest.approx(-0.8) and event.text.startswith("PositionRapidUpdate silent")
+
+
+@pytest.mark.parametrize("words", [[], ["--page", "--port", "0"]])
+def test_a_stop_that_this_release_cannot_read_is_one_sentence(words: list[str], tmp_path: Path) -> None:
+    file = Segment(tmp_path / "000001-1.000s-LATER.mcap", durable=False)
+    file.channel(TOPIC, "json", "Stop", b"{}")
+    file.add(TOPIC, 1, 1, b'{"number": 1, "written": "by a later release"}')
+    file.finish()
+    assert refused(tmp_path, *words).code == "why.unusable"

@@ -12,7 +12,6 @@ from host.exit_codes import CommandFailed
 from timberhand.commands.options import JsonOption, refuse_without_effect
 
 if TYPE_CHECKING:
-    from host.exit_codes import CommandFailed
     from timberhand.why.stops import FoundStop
 
 
@@ -65,7 +64,7 @@ def why(
     try:
         count, newest_utc_ns = _explain(run, every, plot, stops)
     except (OSError, ValueError) as error:
-        raise CommandFailed("why.unusable", f"{run or 'the newest stop'} cannot be shown: {error}") from error
+        raise _unusable(run, error) from error
     failed = newest_failure(newest_utc_ns) if run is None else None
     if not count and run is None and failed is None:
         raise _no_stop(f"below runs/, and none in {SERVICE_STOPS} that you may read")
@@ -96,7 +95,10 @@ def _open_page(run: Path | None, port: int) -> None:
     from timberhand.replay_page import show_recording
     from timberhand.why.stops import find_stops
 
-    found_stop = next(iter(find_stops(run, newest=True)), None)
+    try:
+        found_stop = next(iter(find_stops(run, newest=True)), None)
+    except (OSError, ValueError) as error:
+        raise _unusable(run, error) from error
     if found_stop is None:
         raise _no_stop(f"in {run or 'runs/'}")
     run_folder = found_stop.source if found_stop.source.is_dir() else found_stop.source.parent.parent
@@ -105,8 +107,11 @@ def _open_page(run: Path | None, port: int) -> None:
     )
 
 
-def _no_stop(where: str) -> CommandFailed:
+def _unusable(run: Path | None, error: Exception) -> CommandFailed:
+    return CommandFailed("why.unusable", f"{run or 'the newest stop'} cannot be shown: {error}")
 
+
+def _no_stop(where: str) -> CommandFailed:
     return CommandFailed("why.no-stop", f"there is no stop {where}; name a run")
 
 

@@ -227,11 +227,11 @@ def _lateness(ticks: Ticks) -> Found:
 
 
 def _received(ticks: Ticks) -> Iterator[tuple[str, Database, tuple[int, int, bytes]]]:
-    """Return every frame of the ticks with its bus and the bus's database."""
-    crane, machine = load("crane"), load("machine")
+    """Return every frame of the ticks with its bus and its database, of which mach0 has two."""
+    crane, machine, gnss = load("crane"), load("machine"), load("gnss")
     for tick in ticks:
         yield from (("crane0", crane, frame) for frame in tick.frames_in)
-        yield from (("mach0", machine, frame) for frame in tick.machine_frames_in)
+        yield from (("mach0", machine if machine.find(frame[1]) else gnss, frame) for frame in tick.machine_frames_in)
 
 
 def _label(codec: MessageCodec, name: str, value: Any) -> str:
