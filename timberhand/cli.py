@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import io
 import os
+import select
 import signal
 import sys
 from typing import TYPE_CHECKING, Annotated
@@ -47,6 +48,7 @@ from timberhand.commands import (
 if TYPE_CHECKING:
     from controller.guard.layout import GuardConfigError
 
+STDOUT = 1
 SENTENCE = "Autonomous control of a log-loading forestry machine: crane control over CAN, planning, physics plant."
 app = typer.Typer(
     name="timberhand",
@@ -112,8 +114,7 @@ def main() -> None:
     """
     # Small matrix products in many threads wait for each other: three times as slow on two processors.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    # When the reader of a pipe ends (`timberhand ... | head`), end quietly instead of with a traceback.
-    signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+    signal.signal(signal.SIGPIPE, _end_with_reader)
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # like Ctrl-C: exit code 130
     if "--help" in sys.argv:
         from timberhand import option_help
@@ -129,6 +130,20 @@ def main() -> None:
             raise
         print(f"timberhand: {error} [{error.code}]", file=sys.stderr)
         sys.exit(ExitCode.CONFIGURATION)
+    finally:
+        signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # for what is written at the exit
+
+
+def _end_with_reader(number: int, _: object) -> None:
+    """End quietly when the reader of the output ends (`timberhand ... | head`), instead of with a traceback.
+
+    The other side of a connection, as a browser or a bus, ends nothing: that is for whoever holds the connection.
+    """
+    output = select.poll()
+    output.register(STDOUT, 0)
+    if any(event & select.POLLERR for _, event in output.poll(0)):
+        signal.signal(number, signal.SIG_DFL)
+        signal.raise_signal(number)
 
 
 def _run() -> None:

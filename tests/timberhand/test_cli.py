@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import io
+import os
 import pickle
 import signal
+import socket
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from importlib.metadata import version
@@ -20,6 +23,7 @@ from experiments.common.result import sealed_seed
 from host.exit_codes import CommandFailed, ExitCode
 from tests.autonomy.crane_stand_in import HOME
 from tests.codes import coded
+from timberhand import cli
 from timberhand.cli import _run, app
 from timberhand.commands.runs import new_directory
 from timberhand.reference import __main__
@@ -207,3 +211,42 @@ def test_the_installer_is_given_the_options_by_their_own_names(
     monkeypatch.setattr(installer, "install", lambda words: seen.extend(words) or 7)
     assert CliRunner().invoke(app, ["service", *given]).exit_code == 7
     assert seen == handed_on
+
+
+@pytest.fixture
+def signals() -> Iterator[None]:
+    """Put back what `main` does to this process's signals."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGPIPE, signal.SIGTERM)}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+def test_a_connection_that_its_other_side_closes_ends_no_command(
+    signals: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    survived = []
+
+    def serve() -> None:
+        page, browser = socket.socketpair()
+        browser.close()
+        with page, pytest.raises(BrokenPipeError):
+            page.send(b"state")
+        survived.append(signal.getsignal(signal.SIGPIPE))
+
+    monkeypatch.setattr(cli, "_run", serve)
+    cli.main()
+    assert len(survived) == 1 and signal.getsignal(signal.SIGPIPE) is signal.SIG_DFL, "for what is written at the exit"
+
+
+def test_a_command_ends_with_the_reader_of_its_output_alone(signals: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    ended: list[int] = []
+    monkeypatch.setattr(signal, "raise_signal", ended.append)
+    reading, writing = os.pipe()
+    monkeypatch.setattr(cli, "STDOUT", writing)
+    cli._end_with_reader(signal.SIGPIPE, None)
+    assert ended == []
+    os.close(reading)
+    cli._end_with_reader(signal.SIGPIPE, None)
+    assert ended == [signal.SIGPIPE] and signal.getsignal(signal.SIGPIPE) is signal.SIG_DFL
+    os.close(writing)
