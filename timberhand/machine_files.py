@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -53,6 +54,9 @@ def make(raw: dict[str, Any], where: str, folder: Path) -> Path:
         for name, text in texts.items():
             (folder / name).write_text(text, encoding="utf-8")
     except OSError as error:
+        for name in texts:  # none was there before
+            with contextlib.suppress(OSError):
+                (folder / name).unlink()
         text = f"{folder}: the files cannot be written: {error.strerror}; choose another folder"
         raise CommandFailed("machine.unwritable", text) from None
     return folder / f"{answers.name}.toml"

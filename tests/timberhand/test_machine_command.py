@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import shutil
+import tomllib
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -14,6 +16,7 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from host.exit_codes import CommandFailed, ExitCode
+from machine.draft.questions import answers_text, example
 from tests.codes import coded
 from tests.machine.own_machine import NAME, answers, made
 from timberhand.cli import app
@@ -159,3 +162,20 @@ def test_the_shipped_machines_pass(name: str) -> None:
     told = RUNNER.invoke(app, ["machine", "check", name, "--json"])
     assert told.exit_code == ExitCode.OK
     assert all(finding["note"] for finding in json.loads(told.stdout)["findings"])
+
+
+def test_a_full_disk_leaves_no_part_of_a_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write, folder = Path.write_text, tmp_path / "mine"
+
+    def full(path: Path, text: str, **options: str) -> int:
+        if path.parent == folder and path.suffix == ".urdf":
+            write(path, text[:100], **options)
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return write(path, text, **options)
+
+    raw = tomllib.loads(answers_text(example()))
+    with monkeypatch.context() as patch, pytest.raises(CommandFailed, check=coded("machine.unwritable")):
+        patch.setattr(Path, "write_text", full)
+        make(raw, "answers", folder)
+    assert list(folder.iterdir()) == []
+    assert make(raw, "answers", folder).is_file()
