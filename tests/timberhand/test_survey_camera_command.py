@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from math import radians
 from pathlib import Path
 
@@ -111,3 +112,25 @@ def test_what_cannot_be_is_said_in_one_sentence_and_nothing_is_written(
     assert isinstance(found.exception, TimberhandError)
     assert exit_code_of(found.exception) is code and words in str(found.exception)
     assert not (tmp_path / "mine.toml").exists()
+
+
+def test_a_profile_that_exists_is_kept_and_no_figure_is_missed(tmp_path: Path) -> None:
+    (tmp_path / "mine.toml").write_text("mine")
+    targets = written(tmp_path / "targets.csv", table())
+    found = run(tmp_path, targets, "--joints", "{} {} {} {}".format(*AT_DEG))
+    assert isinstance(found.exception, TimberhandError) and found.exception.code == "calibration.profile-exists"
+    assert exit_code_of(found.exception) is ExitCode.CONFIGURATION
+    assert (tmp_path / "mine.toml").read_text() == "mine"
+
+
+def test_the_envelope_of_a_machine_of_ones_own_goes_with_its_profile(tmp_path: Path) -> None:
+    own, folder = tmp_path / "own", tmp_path / "surveyed"
+    own.mkdir()
+    shutil.copy("machine/palms_471.toml", own / "mine.toml")
+    (own / "palms_471.envelope.toml").write_text("ours")
+    targets = written(tmp_path / "targets.csv", table())
+    joints = "{} {} {} {}".format(*AT_DEG)
+    words = ["survey-camera", "stick", str(targets), "--profile", str(own / "mine.toml"), "--joints", joints]
+    found = CliRunner().invoke(app, [*words, "--out", str(folder / "mine.toml")])
+    assert found.exit_code == 0, found.output
+    assert (folder / "palms_471.envelope.toml").read_text() == "ours"

@@ -52,7 +52,7 @@ def survey_camera(
     from autonomy.perception.camera.frame import link_pose
     from autonomy.perception.camera.survey import surveyed
     from controller.guard.__main__ import profile_path
-    from machine.loading.profile_file import load_profile
+    from machine.loading.profile_file import carry_envelope, load_profile
 
     machine = load_profile(profile)
     observations = load_targets(targets)
@@ -77,10 +77,9 @@ def survey_camera(
     changed: list[tuple[tuple[str, ...], Any, str]] = [
         (("cameras", camera, name), value, remark) for name, value in values.items()
     ]
-    try:
-        write_profile(Path(profile_path(profile)), out, changed, datetime.date.today().isoformat())
-    except InputRefused as error:
-        raise CommandFailed.from_error(error, ExitCode.FIGURE_MISSED) from None
+    source = Path(profile_path(profile))
+    write_profile(source, out, changed, datetime.date.today().isoformat())
+    carry_envelope(source, out.parent)
     if as_json:
         print(json.dumps({"camera": camera, "targets": len(observations.places_m), **values}, indent=2))
     moved_mm = 1000.0 * math.dist(before.position_m, surveyed_camera.position_m)
