@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import io
 import os
+import signal
 from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
 
+from can_dbc.messages.datagrams import decode
 from console.accounts import read_accounts
 from host.exit_codes import CommandFailed, ExitCode
 from runtime.errors import InputRefused
@@ -66,6 +68,23 @@ def test_a_pipe_is_no_terminal() -> None:
         watch(lambda stamp_ns: None, LIMIT_NS, reading, writing)
     os.close(reading)
     os.close(writing)
+
+
+@pytest.mark.parametrize(("number", "told"), [(signal.SIGINT, ["WATCH_END"]), (signal.SIGTERM, [])])
+def test_only_ctrl_c_ends_the_watch_on_purpose(
+    number: signal.Signals, told: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A session that the system ends gets SIGTERM; the command line takes that like Ctrl-C elsewhere."""
+    sent: list[str] = []
+    monkeypatch.setattr("can_dbc.messages.operator_link.send", lambda data, path: sent.append(decode(data).action.name))
+    monkeypatch.setattr("timberhand.terminal_watch.watch", lambda send, limit_ns: signal.raise_signal(number))
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        done = CliRunner().invoke(app, ["operator", "watch", "--operator", "/nowhere"])
+        assert signal.getsignal(signal.SIGTERM) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert sent == told and done.exit_code == (ExitCode.OK if told else ExitCode.INTERRUPTED)
 
 
 def test_a_socket_that_cannot_be_is_refused_as_one_that_nobody_serves() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
 from enum import StrEnum
 from pathlib import Path
@@ -42,9 +43,9 @@ SocketOption = Annotated[
 def watch(profile: ProfileOption = "palms_471", operator: SocketOption = None) -> None:
     """Watch until Ctrl-C, which ends the watch on purpose.
 
-    Every heartbeat is an answer of this terminal. When its link is cut, as by a lost network under ssh, the machine
-    holds within a second, and it cannot be armed until somebody watches again or the watch is ended. Inside screen or
-    tmux the answers are theirs: run those on your own side.
+    Every heartbeat is an answer of this terminal. When its link is cut, as by a lost network under ssh, or the system
+    ends the session (SIGTERM), the machine holds within a second, and it cannot be armed until somebody watches again
+    or the watch is ended. Inside screen or tmux the answers are theirs: run those on your own side.
 
     [bold]Examples[/bold]
 
@@ -61,11 +62,14 @@ def watch(profile: ProfileOption = "palms_471", operator: SocketOption = None) -
             f"{machine.name} watches no link (timeouts.operator_link_ms = 0); set 500 to 1000 in its profile",
         )
     print(f"Watching {machine.name}; Ctrl-C ends the watch. Without this terminal it holds after {limit_ms} ms.")
+    before = signal.signal(signal.SIGTERM, lambda *_: sys.exit(ExitCode.INTERRUPTED))  # not Ctrl-C, as it is elsewhere
     try:
         terminal_watch.watch(lambda stamp_ns: send(OperatorAction.WATCH, stamp_ns), limit_ms * 1_000_000)
     except KeyboardInterrupt:
         send(OperatorAction.WATCH_END, None)
         print("The watch is ended; the machine works on.")
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 @app.command("unwatch")
