@@ -201,17 +201,17 @@ class Updater:
             for step in steps:
                 if step in (Step.BUILD, Step.SEAL) and self._name in self._trees.whole():
                     continue
-                self._report(step.value)
+                self._tell(step.value)
                 self.do(step)
                 if step is Step.VERIFY and self._name == self._trees.state().current:
                     self._trees.prune()
-                    self._report(f"{self._name} is in use already")
+                    self._tell(f"{self._name} is in use already")
                     return
         except BaseException as error:
             # Also Ctrl-C: what began ends in a state that runs.
             if needs_return(self._trees.state()):
                 former = self._trees.state().trial
-                self._report("back to the former release")
+                self._tell("back to the former release")
                 for step in BACK:
                     self.do(step)
                 if isinstance(error, CommandFailed):
@@ -221,6 +221,11 @@ class Updater:
             if isinstance(error, OSError):
                 raise _of_disk(error) from error
             raise
+
+    def _tell(self, line: str) -> None:
+        """Report a line, where that is possible: the terminal may be gone."""
+        with contextlib.suppress(OSError):
+            self._report(line)
 
     def _undo(self) -> None:
         """Leave nothing of an update that changed nothing."""

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import signal
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -13,6 +16,7 @@ from host.release.trees import State, Trees
 from host.release.updater import ROLLBACK, UPDATE, Step, after_interruption
 from tests.codes import coded
 from tests.host.small_releases import DEAD, GOOD, NotedProgram, NotedServices, install, keys, small_bundle, updater
+from timberhand.commands import service
 
 S_NS = 1_000_000_000
 
@@ -61,6 +65,35 @@ def test_a_release_that_does_not_come_up_is_changed_back(made: tuple[list[Path],
     assert in_use(installed) == "1.0" and installed.state().trial is None
     assert services.told == ["stop", "reload", "start", "judged", "stop", "reload", "start", "start others"]
     assert (services.running or "").startswith("1.0")
+
+
+@pytest.mark.parametrize("broken", ["2.0", "no release"])
+def test_a_terminal_that_is_gone_keeps_no_update_from_its_end(
+    made: tuple[list[Path], Path], installed: Trees, broken: str
+) -> None:
+    services = NotedServices(installed, broken)
+
+    def gone(line: str) -> None:
+        if "stop" in services.told:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    with pytest.raises(CommandFailed, check=coded("update.gate")) if broken == "2.0" else nullcontext():
+        updater(installed, made[1], services, report=gone).update(made[0][1])
+    assert in_use(installed) == ("1.0" if broken == "2.0" else "2.0") and installed.state().trial is None
+    assert services.told[-1] == "start others"
+
+
+def test_a_lost_terminal_ends_no_update(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """ssh without a network sends SIGHUP, `| tee` that Ctrl-C ends SIGPIPE: the services would stay stopped."""
+    monkeypatch.setattr(os, "geteuid", lambda: 0)
+    monkeypatch.setattr("timberhand.service_status.SYSTEMD", tmp_path)
+    before = {number: signal.getsignal(number) for number in (signal.SIGHUP, signal.SIGPIPE)}
+    try:
+        service._updater()
+        assert {signal.getsignal(number) for number in before} == {signal.SIG_IGN}
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 @pytest.mark.parametrize("mode", ["ARMED", "ACTIVE"])

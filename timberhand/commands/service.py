@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import sys
 import time
 from pathlib import Path
@@ -182,6 +183,8 @@ def _updater() -> Updater:
     from host.release.updater import PLACE, SIGNER, ReleaseProgram, Updater
     from timberhand.service_status import SYSTEMD
 
+    for number in (signal.SIGHUP, signal.SIGPIPE):  # a lost terminal, or reader of the output, leaves nothing half done
+        signal.signal(number, signal.SIG_IGN)
     if os.geteuid() != 0:
         raise CommandFailed("update.not-root", "this needs root; start it with sudo")
     if not SYSTEMD.is_dir():
