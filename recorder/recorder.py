@@ -149,6 +149,7 @@ class Recorder:
         self._now_ns = manifest.start_monotonic_ns or 0
         self._segments = 0
         self._segment: Segment | None = None
+        self._text: dict[str, CommitFile] = {}
         try:
             directory.mkdir(parents=True, exist_ok=True)
             if run_files(directory):
@@ -157,9 +158,13 @@ class Recorder:
                     "recording.exists", f"{directory} already contains a recording; give another directory"
                 )
             manifests.write(directory, manifest)
-            self._text = {bus: CommitFile(directory / f"{bus}.log", self._durable) for bus in manifest.buses}
+            for bus in manifest.buses:
+                self._text[bus] = CommitFile(directory / f"{bus}.log", self._durable)
             self._open_segment()
         except OSError as error:
+            for bus, text in self._text.items():  # else the next attempt finds them
+                text.close()
+                (directory / f"{bus}.log").unlink(missing_ok=True)
             raise InputRefused(
                 "recording.cannot-write",
                 f"cannot record in {directory} ({error.strerror}); free space on the disk or give another directory",

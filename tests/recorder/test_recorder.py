@@ -244,10 +244,20 @@ class FullDisk:
         monkeypatch.setattr(segment.os, "pwrite", pwrite)
 
 
-def test_full_disk_at_start_is_refused(tmp_path, monkeypatch):
-    FullDisk(monkeypatch).full = True
+def test_full_disk_at_start_is_refused_until_there_is_space(tmp_path, monkeypatch):
+    (disk := FullDisk(monkeypatch)).full = True
     with pytest.raises(InputRefused, match=os.strerror(errno.ENOSPC), check=coded("recording.cannot-write")):
         Recorder(tmp_path, PROFILE, manifest())
+    disk.full = False
+    record(tmp_path, 10)
+    assert ticks_of(tmp_path / "run.mcap") == [tick(k) for k in range(10)]
+
+
+def test_a_candump_file_of_somebody_else_is_kept(tmp_path):
+    (tmp_path / "crane0.log").write_text("mine")
+    with pytest.raises(InputRefused, check=coded("recording.cannot-write")):
+        Recorder(tmp_path, PROFILE, manifest())
+    assert (tmp_path / "crane0.log").read_text() == "mine"
 
 
 def test_full_disk_while_running_costs_counted_records_and_nothing_else(recorder, tmp_path, monkeypatch):
