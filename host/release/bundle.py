@@ -163,7 +163,7 @@ def check(folder: Path, public: Path) -> Release:
     """Check signature and files of an unpacked bundle; returns what it is.
 
     Raises:
-        CommandFailed: it is not what somebody with that key signed, or not for this computer.
+        CommandFailed: it is not what somebody with that key signed.
     """
     if not (folder / SUMS).is_file():
         raise CommandFailed(
@@ -176,13 +176,19 @@ def check(folder: Path, public: Path) -> Release:
     if wrong:
         raise CommandFailed("bundle.changed", f"{wrong[0]} in the bundle is not what was signed; get the bundle again")
     release = Release(**json.loads((folder / MARKER).read_text()))
+    if not _NAME.fullmatch(release.name):
+        raise CommandFailed("bundle.name", f"{release.name!r} is no name of a release")
+    return release
+
+
+def check_for_here(folder: Path, public: Path) -> Release:
+    """Check a bundle that is to be installed on this computer, as `check` does; raises CommandFailed."""
+    release = check(folder, public)
     if release.machine != platform.machine():
         raise CommandFailed(
             "bundle.other-machine",
             f"the bundle is for {release.machine}, and this computer is {platform.machine()}; get that one",
         )
-    if not _NAME.fullmatch(release.name):
-        raise CommandFailed("bundle.name", f"{release.name!r} is no name of a release")
     return release
 
 

@@ -247,7 +247,7 @@ class Updater:
             case Step.UNPACK:
                 bundles.unpack(self._bundle, trees.incoming)
             case Step.VERIFY:
-                self._name = bundles.check(trees.incoming, self._signer).name
+                self._name = bundles.check_for_here(trees.incoming, self._signer).name
             case Step.BUILD:
                 trees.releases.mkdir(parents=True, exist_ok=True)
                 self._program.build(trees.incoming, trees.tree(self._name))

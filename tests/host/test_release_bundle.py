@@ -94,7 +94,9 @@ def test_a_bundle_for_another_processor_is_refused(unpacked: tuple[Path, Path, P
     (folder / bundles.SUMS).write_text(sums.encode(sums.of_files(folder, names)))
     sign(folder / bundles.SUMS, private)
     with pytest.raises(CommandFailed, check=coded("bundle.other-machine")):
-        bundles.check(folder, public)
+        bundles.check_for_here(folder, public)
+    verified = RUNNER.invoke(app, ["release", "verify", str(folder), "--public-key", str(public)])
+    assert verified.exit_code == 0 and "riscv64" in verified.stdout, "who makes bundles for others verifies them, too"
 
 
 def test_the_same_wheel_gives_the_same_bytes(tmp_path: Path) -> None:
