@@ -136,8 +136,8 @@ def buses() -> Iterator[Finding]:
         yield fine("buses", f"SocketCAN: {', '.join(can_interfaces) or 'no interface yet'}; the wire")
     for setting in ("CRANE_BUS", "MACHINE_BUS"):
         address = settings.get(setting, "")
-        name = address.removeprefix(PYTHON_CAN).removeprefix("socketcan:")
-        if name != address and name not in interfaces:
+        backend, _, name = address.removeprefix(PYTHON_CAN).partition(":")
+        if backend == "socketcan" and name not in interfaces:
             wrong = f"{setting}={address} in {CONF}, but there is no interface {name}"
             commands = (f"sudo nano {CONF}", "ip -brief link show type can")
             yield Finding("buses", CHANGE, wrong, "the controller service finds its bus", commands)

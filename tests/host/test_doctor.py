@@ -232,6 +232,23 @@ def test_an_interface_of_any_name_comes_up_by_the_services_of_the_buses(tree: Tr
         assert set(re.findall(r"timberhand-can@(\w+)", command)) == {"crane0", "mach0"}
 
 
+@pytest.mark.parametrize(
+    ("address", "missing"),
+    [
+        ("socketcan:nowhere0", ["CRANE_BUS"]),
+        ("python-can:socketcan:nowhere0", ["CRANE_BUS"]),
+        ("socketcan:lo", []),
+        ("kvaser:0", []),
+        ("python-can:kvaser:0", []),
+    ],
+)
+def test_only_interfaces_of_the_kernel_are_looked_for(
+    address: str, missing: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(installation, "_settings", lambda: {"CRANE_BUS": address})
+    assert [f.sentence.split("=")[0] for f in installation.buses() if f.severity is Severity.CHANGE] == missing
+
+
 def test_the_greatest_gain_comes_first(tree: Tree) -> None:
     names = [finding.what for finding in evaluate(tree())]
     assert names[:3] == ["priority", "memory", "kernel"]
