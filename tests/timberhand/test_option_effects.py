@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 
 from host.exit_codes import CommandFailed, ExitCode
 from timberhand.cli import app
+from timberhand.commands.experiment import READERS
 
 VALUES = {"--bus": "wire", "--camera": "stick", "--clock": "real", "--plc-link": "modbus", "--plc-role": "valves"}
 """Of the options that allow certain words; all others take a number."""
@@ -101,3 +102,12 @@ def test_a_port_that_no_computer_has_is_refused_at_once() -> None:
 def test_a_page_has_a_port(words: tuple[str, ...]) -> None:
     done = CliRunner().invoke(app, [*words, "--console-port", "0"], env={"COLUMNS": "200"})
     assert done.exit_code == ExitCode.USAGE and "--console-port" in done.output
+
+
+def test_the_help_of_an_option_names_every_experiment_that_reads_it() -> None:
+    command: Any = get_command(app)
+    command = command.commands["experiment"]
+    helps = {parameter.name: parameter.help for parameter in command.params if parameter.name in READERS}
+    assert helps.keys() == READERS.keys()
+    for name, readers in READERS.items():
+        assert [reader for reader in readers if f"{reader}:" not in helps[name]] == [], name

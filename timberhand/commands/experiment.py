@@ -97,7 +97,10 @@ def experiment(
     bus: Annotated[Bus, typer.Option(help="soak: vcan (in user-mode Linux if necessary) or wire.")] = Bus.WIRE,
     data: Annotated[
         Path | None,
-        typer.Option(help="grasp-network: folder of Cornell samples on which to evaluate the shipped weights."),
+        typer.Option(
+            help="grasp-network: folder of Cornell samples on which to evaluate the shipped weights; detector: folder "
+            "of photographs."
+        ),
     ] = None,
     planner: ForeignPlannerOption = "",
     detector: ForeignDetectorOption = "",
