@@ -11,6 +11,8 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from host.exit_codes import ExitCode
+from recorder.manifest import read
+from recorder.recover import is_complete
 from runtime.errors import TimberhandError
 from runtime.plot_style import MOSS, OIL, RUST, TIMBER
 from tests.autonomy.mission_texts import at, gpx, gpx_points
@@ -126,3 +128,12 @@ def test_names_are_drawn_as_they_are(name: str, tmp_path: Path) -> None:
     mission["features"].append(log | {"properties": {"role": "landing", "name": name}})
     (tmp_path / "priced.geojson").write_text(json.dumps(mission))
     assert run("show", tmp_path / "priced.geojson", "--png", tmp_path / "a.png").exit_code == 0
+
+
+def test_an_interrupted_demonstration_leaves_a_whole_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("hil.demonstrations.demonstrate", interrupted)
+    run("demonstrate", tmp_path / "a.csv", "--record", tmp_path / "by-hand")
+    assert is_complete(tmp_path / "by-hand" / "run.mcap") and read(tmp_path / "by-hand").complete

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -245,7 +246,10 @@ def demonstrate(
         machine = load_profile(profile)
         buses = tuple(name for name in (machine.crane_bus, machine.machine_bus) if name)
         recorder = Recorder(record, machine, describe(machine, buses, seed)) if record is not None else None
-        with Progress(console=error_console, transient=True, disable=not error_console.is_terminal) as bar:
+        with (
+            contextlib.nullcontext() if recorder is None else contextlib.closing(recorder),
+            Progress(console=error_console, transient=True, disable=not error_console.is_terminal) as bar,
+        ):
             task = bar.add_task("motions", total=None)
             frames = demonstrate_motions(
                 profile,
@@ -255,8 +259,6 @@ def demonstrate(
                 recorder,
                 lambda done, total: bar.update(task, completed=done, total=total),
             )
-        if recorder is not None:
-            recorder.close()
     except ValueError as error:
         raise CommandFailed.from_error(error) from None
     motions = segment_motions(machine, joint_track(machine, load("crane"), frames))
