@@ -17,10 +17,9 @@ from machine.geometry.kinematics import pin_position
 from machine.geometry.optics import BODY_FROM_OPTICAL, rpy_matrix
 from machine.joints import JOINTS, Joint
 from machine.profile import Profile
-from machine.status.explanation import describe
 from machine.status.modes import Mode
 from machine.status.stale_inputs import STALE_INPUT_NAMES
-from ros2.execution.execution import Progress
+from ros2.execution.execution import Progress, described
 from ros2.interfaces.builtin import (
     NS_PER_S,
     UUID,
@@ -172,7 +171,7 @@ def diagnostics(machine: str, report: StateReport | None, refused: str, stamp_ns
     mode = next((mode for mode in Mode if mode == report.mode), None)
     name = str(report.mode) if mode is None else mode.name
     level = WARN if mode is None else _LEVELS.get(mode, WARN if report.reason else OK)
-    text = f"{name}: {describe(report.reason, numbers=report.numbers)}" if report.reason else name
+    text = f"{name}: {described(report.reason, report.numbers)}" if report.reason else name
     stale_inputs = [input_name for bit, input_name in sorted(STALE_INPUT_NAMES.items()) if report.stale_mask >> bit & 1]
     values = {
         "mode": name,

@@ -26,7 +26,7 @@ from machine.joints import JOINTS, N_JOINTS, Joint
 from machine.profile import Profile, joint
 from machine.status.explanation import describe, sentence_of
 from machine.status.modes import Mode
-from machine.status.reasons import Reason
+from machine.status.reasons import Reason, known
 from ros2.execution.goal_motion import GoalMotion, GoalRefused, Tolerances, beyond, goal_motion, tolerances_of, unit_of
 from ros2.interfaces.action import Status
 from ros2.interfaces.builtin import NS_PER_S, nanoseconds
@@ -245,13 +245,11 @@ class TrajectoryExecution:
         report = self._inbox.report
         if problem is not None:
             reason = report.reason & 0xFF
-            text = (
-                f"{problem.sentence}: {describe(report.reason, numbers=report.numbers)}" if reason else problem.sentence
-            )
+            text = f"{problem.sentence}: {described(report.reason, report.numbers)}" if reason else problem.sentence
             return Outcome(Status.ABORTED, reason or Reason.NOT_ARMED, text)
         strangers = report.refusal == Reason.DATAGRAM_AUTHENTICATION  # whom every process can be
         if (report.refused - run.refused_before) & 0xFFFF >= REFUSED_LIMIT_COUNT and not strangers:
-            return Outcome(Status.ABORTED, report.refusal & 0xFF, describe(report.refusal))
+            return Outcome(Status.ABORTED, report.refusal & 0xFF, described(report.refusal))
         return None
 
     def _judge(self, run: _Run, tracker: TrajectoryTracker, measured: Sequence[float], now_ns: int) -> None:
@@ -307,6 +305,13 @@ def _sentence(errors: Sequence[float], tolerance: Axes) -> str:
     if worst_joint is None:
         return ""
     return f"{worst_joint.name.lower()} is {abs(errors[worst_joint]):.3f} {unit_of(worst_joint)} from"
+
+
+def described(reason: int, numbers: Sequence[float] = ()) -> str:
+    """Describe a reason of the controller, also one that this release does not know."""
+    if known(reason) is None:
+        return f"The controller reports the unknown reason {reason & 0xFF}; run controller and bridge of one release."
+    return describe(reason, numbers=numbers)
 
 
 def _of(values: Sequence[float], joints: tuple[Joint, ...]) -> Axes:

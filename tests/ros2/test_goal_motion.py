@@ -194,6 +194,14 @@ def test_a_silent_controller_ends_the_goal() -> None:
     assert outcome is not None and outcome.error_code == Reason.NOT_ARMED
 
 
+@pytest.mark.parametrize("last", [report(Mode.STOP, reason=250), report(refused=3, refusal=250)])
+def test_a_reason_of_another_release_ends_the_goal_and_not_the_bridge(last: StateReport) -> None:
+    made = execution(report())
+    made.begin(SLEW, 0, 0)
+    outcome = made.step(20_000_000, last)[1]
+    assert outcome is not None and outcome.error_code == 250 and "unknown reason 250" in outcome.sentence
+
+
 # -- the goals of the action server
 A, B, C = (bytes([i]) * 16 for i in (1, 2, 3))
 DONE = Result(0, "done")

@@ -116,6 +116,7 @@ def test_joint_states_have_known_joints_only() -> None:
         (report(Mode.ARMED), OK, "ARMED"),
         (report(Mode.STOP, reason=Reason.LEASE_LOST), WARN, "[LEASE_LOST]"),
         (report(Mode.FAULT, reason=Reason.NODE_ABSENT), ERROR, "[NODE_ABSENT]"),
+        (report(Mode.STOP, reason=250), WARN, "unknown reason 250"),
         (None, STALE, ""),
     ],
 )
