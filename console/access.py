@@ -218,10 +218,9 @@ class Access:
             return f"{holder} has control; take it over first." if holder else "Nobody has control; take control first."
         return ""
 
-    def is_valid(self, page: Page | None) -> bool:
-        """Tell whether a page may go on; one that only looks, without a token, may."""
-        self._forget()
-        return page is None or page.token in self._pages
+    def is_valid(self, page: Page | None, session: str) -> bool:
+        """Tell whether a page may go on; one that only looks, without a token, may while its session may look."""
+        return self.person(session) is not None and (page is None or page.token in self._pages)
 
     def give_back(self, page: Page) -> None:
         """End the page's lease, which it does not need any more."""

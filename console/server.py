@@ -300,7 +300,7 @@ def create_app(console: Console, allow_hosts: Collection[str] = ()) -> Starlette
         hearing = asyncio.create_task(_hear(socket, console, page, panel))
         with contextlib.suppress(WebSocketDisconnect), console.access.connected(page):
             sent_count = 0
-            while not hearing.done() and console.access.is_valid(page):
+            while not hearing.done() and console.access.is_valid(page, socket.scope["session"]):
                 state, mission_state = console.state_for(page, person), console.crane_state.mission_state
                 if sent_count != mission_state.report_count:
                     sent_count, state["mission"] = mission_state.report_count, mission_state.mission()

@@ -412,6 +412,16 @@ def test_a_session_ends_by_signing_out_and_with_the_shift(guarded: Stage) -> Non
     assert other.get("/api/state").status_code == 401
 
 
+def test_a_websocket_without_a_token_ends_with_its_session_too(guarded: Stage) -> None:
+    viewer = signed_in(guarded.console, "viewer")
+    with viewer.websocket_connect(WS, headers=BROWSING) as ws:
+        ws.receive_json()
+        assert viewer.post("/api/sign-out").status_code == 204
+        with pytest.raises(WebSocketDisconnect):
+            for _ in range(100):
+                ws.receive_json()
+
+
 def test_passwords_are_not_guessed(guarded: Stage) -> None:
     stranger = visitor(guarded.console, "192.0.2.9")
     for name in ("operator", "nobody", "operator", "", "x" * 2000)[:MAX_FAILURES]:
