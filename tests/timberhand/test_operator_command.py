@@ -78,12 +78,14 @@ def test_only_ctrl_c_ends_the_watch_on_purpose(
     sent: list[str] = []
     monkeypatch.setattr("can_dbc.messages.operator_link.send", lambda data, path: sent.append(decode(data).action.name))
     monkeypatch.setattr("timberhand.terminal_watch.watch", lambda send, limit_ns: signal.raise_signal(number))
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    both = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.signal(each, signal.default_int_handler) for each in both]  # as the command line sets them
     try:
         done = CliRunner().invoke(app, ["operator", "watch", "--operator", "/nowhere"])
         assert signal.getsignal(signal.SIGTERM) is signal.default_int_handler
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for each, handler in zip(both, before, strict=True):
+            signal.signal(each, handler)
     assert sent == told and done.exit_code == (ExitCode.OK if told else ExitCode.INTERRUPTED)
 
 
