@@ -94,7 +94,9 @@ async def _ask(desk: Path, request: dict[str, str]) -> dict[str, Any]:
                 response = json.loads(await reader.readline())
             finally:
                 writer.close()
-    except (OSError, ValueError, TimeoutError) as error:
+    except TimeoutError:
+        return {"error": f"The run's desk of faults does not answer within {ANSWER_S:.0f} s."}
+    except (OSError, ValueError) as error:
         return {"error": f"The run's desk of faults does not answer ({error})."}
     return response if isinstance(response, dict) else {}
 
