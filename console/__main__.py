@@ -230,10 +230,16 @@ def _address(text: str | None, option: str) -> tuple[str, int] | None:
         return None
     host, _, port = text.rpartition(":")
     try:
-        return str(ipaddress.IPv4Address(host or "127.0.0.1")), _port(port)
+        address = str(ipaddress.IPv4Address(host or "127.0.0.1")), _port(port)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
+            link.connect(address)
     except (ValueError, argparse.ArgumentTypeError):
         sentence = f"{option} {text} is not HOST:PORT with an IPv4 address, as in 127.0.0.1:5005"
         raise StartError("console.address", sentence, 2) from None
+    except OSError as error:
+        sentence = f"{option} {text} cannot be reached from this computer ({error.strerror}); give another address"
+        raise StartError("console.address", sentence, 2) from None
+    return address
 
 
 def _port(text: str) -> int:
@@ -309,7 +315,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     a = parser.parse_args(arguments)
     if (a.report_port is None) == (a.plant is None):
         parser.error("give --report-port (the operator's page) or --plant (the view of a simulated plant)")
-    signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGINT))
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         if a.plant is not None:
             serve_plant(port=a.port, plant=a.plant, bind=a.bind, allow_hosts=a.allow_host)

@@ -9,6 +9,7 @@ import hashlib
 import json
 import math
 import re
+import signal
 import socket
 from dataclasses import replace
 from pathlib import Path
@@ -419,3 +420,37 @@ def test_an_address_that_takes_no_datagram_is_refused(text: str) -> None:
     assert address_of("127.0.0.1:24705", "--planner") == address_of("24705", "--planner") == ("127.0.0.1", 24705)
     with pytest.raises(StartError, match=f"--planner {re.escape(text)} is not .* IPv4", check=coded("console.address")):
         address_of(text, "--planner")
+
+
+def test_an_address_to_which_there_is_no_way_is_refused() -> None:
+    with pytest.raises(
+        StartError, match="--scene 255.255.255.255:24705 cannot be reached", check=coded("console.address")
+    ):
+        address_of("255.255.255.255:24705", "--scene")
+
+
+def test_a_termination_ends_the_process_while_it_starts_although_ctrl_c_is_ignored(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As a shell ignores it for what a script starts in the background."""
+
+    def terminated(_name: str) -> None:
+        signal.raise_signal(signal.SIGTERM)
+        raise AssertionError("the process goes on")
+
+    monkeypatch.setattr("console.__main__.load_profile", terminated)
+    before = [signal.signal(number, signal.SIG_IGN) for number in (signal.SIGINT, signal.SIGTERM)]
+    try:
+        assert main(["--report-port", "0"]) == 0
+    finally:
+        for number, handler in zip((signal.SIGINT, signal.SIGTERM), before, strict=True):
+            signal.signal(number, handler)
+
+
+def test_a_desk_of_faults_that_hangs_is_told_with_the_time_that_was_waited(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def hang(*_: object, **__: object) -> None:
+        raise TimeoutError
+
+    monkeypatch.setattr(asyncio, "open_unix_connection", hang)
+    told = asyncio.run(server._ask(Path("desk"), {"op": "list"}))
+    assert "6 s" in told["error"] and "()" not in told["error"]
