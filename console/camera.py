@@ -48,18 +48,20 @@ class CameraState:
         self.jpegs: dict[int, bytes] = {}
         self.facts: PictureFacts | None = None
         self._problem = ""
-        self._begun_ns = self._answered_ns = 0
+        self._asked_ns = self._unanswered_ns = self._answered_ns = 0
         self._without_camera = False
         self._place: Place | None = None
 
     def request(self, now_ns: int) -> bytes:
         """Encode the next request to the detector: for a picture that is newer than this one."""
-        self._begun_ns = self._begun_ns or now_ns
+        if not self._unanswered_ns or now_ns - self._asked_ns > SILENT_NS:
+            self._unanswered_ns = now_ns  # nobody looked for a while: an old question tells nothing
+        self._asked_ns = now_ns
         return encode_picture_request(self.facts.measured_ns if self.facts else 0)
 
     def on_reply(self, data: bytes, now_ns: int, place: Place | None) -> None:
         """Take a datagram of the detector; ``place`` is where the vehicle is now, None for a stationary machine."""
-        self._answered_ns = now_ns
+        self._answered_ns, self._unanswered_ns = now_ns, 0
         try:
             facts, jpeg = decode_picture(data)
         except InputRefused as error:
@@ -77,11 +79,10 @@ class CameraState:
         facts = self.facts
         if facts is None:
             return {"picture": 0, "words": self._why_none(now_ns)}
-        silent = now_ns - self._answered_ns > SILENT_NS
         moved = self._moved(place)
         return {
             "picture": facts.measured_ns,
-            "words": SILENT if silent else self._problem,
+            "words": SILENT if self._silent(now_ns) else self._problem,
             "age_s": round(max(0, now_ns - facts.measured_ns) * 1e-9, 1),
             "camera": facts.camera,
             "width_px": facts.width_px,
@@ -106,11 +107,16 @@ class CameraState:
             },
         }
 
+    def _silent(self, now_ns: int) -> bool:
+        return bool(self._unanswered_ns) and now_ns - self._unanswered_ns > SILENT_NS
+
     def _why_none(self, now_ns: int) -> str:
+        if self._silent(now_ns):
+            return SILENT
         if self._without_camera:
             return NO_CAMERA
         if not self._answered_ns:
-            return SILENT if self._begun_ns and now_ns - self._begun_ns > SILENT_NS else WAITING
+            return WAITING
         return f"No picture: {self._problem}." if self._problem else NO_PICTURE
 
     def _moved(self, place: Place | None) -> bool:

@@ -104,7 +104,27 @@ def test_every_state_without_a_picture_has_its_words() -> None:
     state.on_reply(encode_picture(PictureFacts(1, "stick", 7, "unplugged")), 17, None)
     page = state.page(18, None, None)
     assert (page["picture"], page["words"]) == (7, "unplugged") and state.jpegs == {7: JPEG}
-    assert state.page(17 + SILENT_NS + 1, None, None)["words"] == SILENT
+    state.request(18)
+    assert state.page(18 + SILENT_NS + 1, None, None)["words"] == SILENT
+
+
+@pytest.mark.parametrize("last", [b"no picture", encode_picture(PictureFacts(1, "stick", 0, ""))])
+def test_a_detector_that_has_ended_before_its_first_picture_is_told_as_silent(last: bytes) -> None:
+    state = CameraState()
+    state.request(5)
+    state.on_reply(last, 6, None)
+    for at_ns in range(10, SILENT_NS + 20, SILENT_NS // 5):
+        state.request(at_ns)
+    assert state.page(SILENT_NS + 20, None, None)["words"] == SILENT
+
+
+def test_a_detector_that_was_not_asked_for_a_while_is_not_told_as_silent() -> None:
+    state = CameraState()
+    state.request(5)
+    state.on_reply(encode_picture(FACTS, JPEG), 6, None)
+    state.request(7)  # its answer is lost, and the page shows another panel
+    state.request(10 * SILENT_NS)
+    assert state.page(10 * SILENT_NS + 1, None, None)["words"] == ""
 
 
 def test_the_picture_is_served_and_the_detector_is_asked_at_most_twice_a_second() -> None:
