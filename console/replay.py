@@ -63,6 +63,7 @@ class Overview:
             else:
                 vehicle.accept(report, report.stamp_ns)
         self.entries: list[dict[str, Any]] = list(timeline.entries)
+        self.count = timeline.count
         self.trail: list[Metres] = list(vehicle.mission_state.trail)
 
 
@@ -125,7 +126,7 @@ class ReplayView:
             self.playing = self.at_ns < self._recording.end_ns
         state = self._state.state(self.at_ns)
         state |= {
-            "entries": len(self._overview.entries),
+            "entries": self._overview.count,
             "sent_ms": now_ns // 1_000_000,
             "may_stop": False,
             "may_command": False,

@@ -68,6 +68,17 @@ def test_a_seek_shows_the_state_and_the_plot_of_then(view: ReplayView) -> None:
         assert at_s(view.step(0)) == nearer
 
 
+def test_a_run_with_more_entries_than_are_kept_is_told_by_the_number_of_the_last(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The page asks for the timeline until it has that one."""
+    monkeypatch.setattr("console.replay.MAX_ENTRIES", 1)
+    run = RecordedRun()
+    overview = Overview(run, PROFILE)
+    told = ReplayView(run, PROFILE, overview, {}).step(0)["entries"]
+    assert len(overview.entries) == 1 and told == overview.entries[-1]["n"] > 1
+
+
 @pytest.mark.parametrize(
     "text", ["", "seek", "play 3", "seek nan", "seek 1e9", "speed", "arm", "seek 1 2", "panel  can"]
 )
