@@ -54,7 +54,16 @@ class PlantLink(asyncio.DatagramProtocol):
             try:
                 return await asyncio.wait_for(self._waiting, RESPONSE_TIMEOUT_S)
             except TimeoutError:
+                await self._open_again()
                 return None
+
+    async def _open_again(self) -> None:
+        """Go on from another port, so that a late answer is not taken for that to the next request."""
+        assert self._transport is not None
+        former = self._transport
+        plant: Address = former.get_extra_info("peername")
+        await asyncio.get_running_loop().create_datagram_endpoint(lambda: self, remote_addr=plant)
+        former.close()
 
 
 # -- A live 3-D view of a simulated plant: relays the plant's responses to a page.

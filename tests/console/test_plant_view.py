@@ -83,6 +83,26 @@ def test_a_silent_plant_is_reported() -> None:
     assert answer.status_code == 504 and answer.text
 
 
+def test_an_answer_that_comes_late_is_not_taken_for_that_to_the_next_request(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("console.plant_link.RESPONSE_TIMEOUT_S", 0.1)
+    with udp_end(5.0) as plant:
+
+        def answer() -> None:
+            _, first = plant.recvfrom(4096)
+            _, second = plant.recvfrom(4096)
+            for answer, sender in (({"title": "a plant"}, first), ({"error": "no lever boom"}, second)):
+                plant.sendto(json.dumps(answer).encode(), sender)
+
+        thread = threading.Thread(target=answer)
+        thread.start()
+        with page_of(plant.getsockname()) as page:
+            assert page.get("/api/plant").status_code == 504
+            monkeypatch.setattr("console.plant_link.RESPONSE_TIMEOUT_S", 5.0)
+            refused = page.post("/api/plant/lever?name=boom&value=0.6")
+        thread.join()
+    assert (refused.status_code, refused.text) == (409, "no lever boom")
+
+
 # -- the true logs
 
 PROFILE = load_profile("palms_471")
