@@ -10,6 +10,7 @@ import asyncio
 import json
 import os
 import re
+import threading
 from collections.abc import Awaitable, Callable
 from datetime import UTC, datetime
 from pathlib import Path
@@ -177,9 +178,9 @@ class CommissionApi:
 def _write_once(path: Path, told: dict[str, Any]) -> None:
     """Write a protocol, whole or not at all, and never over another."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_name(f".{path.name}.{os.getpid()}")
+    draft = path.with_name(f".{path.name}.{os.getpid()}.{threading.get_ident()}")
     try:
-        draft.write_text(json.dumps(told, indent=2, ensure_ascii=False) + "\n")
+        draft.write_text(json.dumps(told, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
         os.link(draft, path)
     finally:
         draft.unlink(missing_ok=True)

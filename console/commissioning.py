@@ -78,6 +78,7 @@ class Commissioning:
     _thread: threading.Thread | None = None
     _failure: str = ""
     _said: str = ""
+    _beginning: threading.Lock = field(default_factory=threading.Lock)
 
     @property
     def busy(self) -> bool:
@@ -137,11 +138,13 @@ class Commissioning:
         goes_on: Callable[[], bool],
         finish: Callable[[], str],
     ) -> None:
-        assert not self.busy
-        self._doing, self._procedure, self._failure, self._said = doing, run, "", ""
-        work = (run, keys, goes_on, finish)
-        self._thread = threading.Thread(target=self._work, args=work, name="commissioning", daemon=True)
-        self._thread.start()
+        with self._beginning:
+            if self.busy:
+                raise InputRefused("commission.busy", "something runs already; wait, or end it")
+            self._doing, self._procedure, self._failure, self._said = doing, run, "", ""
+            work = (run, keys, goes_on, finish)
+            self._thread = threading.Thread(target=self._work, args=work, name="commissioning", daemon=True)
+            self._thread.start()
 
     def _work(
         self, run: Procedure, keys: tuple[int, ...], goes_on: Callable[[], bool], finish: Callable[[], str]
