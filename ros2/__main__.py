@@ -59,6 +59,7 @@ def arguments(argv: list[str]) -> argparse.Namespace:
 def main(argv: list[str] | None = None) -> int:
     """Run the bridge; returns the exit code."""
     options = arguments(sys.argv[1:] if argv is None else argv)
+    signals = catch_signals()
     try:
         profile = load_profile(options.profile)
         key = None if options.key_file is None else read_key(options.key_file)
@@ -71,7 +72,6 @@ def main(argv: list[str] | None = None) -> int:
         link = ControllerLink(options.controller, options.report_port, number, key)
     except (OSError, OverflowError) as error:
         return complain(f"UDP port {options.report_port} cannot be opened ({error}); choose another one", ExitCode.BUS)
-    signals = catch_signals()
     try:
         node = open_node(NAME, options)
         stream = SetpointStream(number, options.lease_ms * 1_000_000, key)

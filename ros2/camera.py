@@ -99,6 +99,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--rate-hz", type=_rate, default=4.0, help="greatest rate of the pictures")
     add_node_options(parser)
     options = parser.parse_args(argv)
+    signals = catch_signals()
     try:
         profile = load_profile(options.profile)
     except ProfileError as error:
@@ -106,7 +107,6 @@ def main(argv: list[str] | None = None) -> int:
     if options.camera not in profile.cameras:
         known = ", ".join(profile.cameras) or "none"
         return complain(f"{profile.name} has no camera {options.camera!r}; it has: {known}")
-    signals = catch_signals()
     source = StreamCamera(options.frames, options.camera, FRAME_TIMEOUT_S)
     try:
         camera = CameraNode(open_node(f"timberhand_{options.camera}", options), options.camera, source)

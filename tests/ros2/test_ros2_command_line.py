@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import signal
 import socket
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from hil.harness.processes import free_udp_ports
+from machine.loading.profile_file import load_profile
+from machine.profile import Profile
 from ros2.__main__ import main
 from ros2.camera import main as camera_main
 
@@ -39,6 +43,23 @@ def test_a_port_in_use(port: str, capsys: pytest.CaptureFixture[str]) -> None:
         taken.bind(("127.0.0.1", int(port)))
         assert main(["--report-port", port]) == 4
     assert port in capsys.readouterr().err
+
+
+def test_ctrl_c_while_it_starts_ends_it_with_its_exit_code(port: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(name: str) -> Profile:
+        signal.raise_signal(signal.SIGINT)
+        return load_profile(name)
+
+    monkeypatch.setattr("ros2.__main__.load_profile", interrupted)
+    monkeypatch.setattr("ros2.__main__.open_node", lambda *_: None)
+    monkeypatch.setattr("ros2.__main__.Bridge", lambda *_: SimpleNamespace(busy=False))
+    before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        assert main(["--report-port", port]) == 130
+    finally:
+        for number, handler in zip((signal.SIGINT, signal.SIGTERM), before, strict=True):
+            signal.signal(number, handler)
 
 
 def test_an_interface_that_is_not_there(port: str, capsys: pytest.CaptureFixture[str]) -> None:
