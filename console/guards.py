@@ -4,7 +4,7 @@ A foreign ``Host`` is DNS rebinding; a foreign ``Origin`` on the websocket or on
 this browser.  Both are refused with a sentence.  Every response carries a policy that only lets the page load resources
 from this server (docs/reference/safety.md section 3).
 
-`page_route`, `json_route` and `body_of` are what the handlers of several pages have in common.
+`page_route`, `json_route`, `send` and `body_of` are what the handlers of several pages have in common.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from starlette.websockets import WebSocket, WebSocketDisconnect
 
 STATIC: Final = Path(__file__).with_name("static")
 LOOPBACK_NAMES: Final = ("127.0.0.1", "localhost", "::1")
@@ -118,6 +119,14 @@ def json_route(path: str, content: Callable[[], Any]) -> Route:
         return JSONResponse(content())
 
     return Route(path, answer)
+
+
+async def send(socket: WebSocket, text: str) -> None:
+    """Send a message; raises WebSocketDisconnect when the page is gone, also if it only answers no ping any more."""
+    try:
+        await socket.send_text(text)
+    except RuntimeError as closed:  # uvicorn's word for a connection that it has closed itself
+        raise WebSocketDisconnect(1006) from closed
 
 
 async def body_of(request: Request, most: int) -> bytes | None:

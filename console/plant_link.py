@@ -18,7 +18,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from autonomy.perception.log_list import decode_logs
-from console.guards import STATIC, guarded, is_loopback, page_route
+from console.guards import STATIC, guarded, is_loopback, page_route, send
 from runtime.errors import InputRefused
 
 RESPONSE_TIMEOUT_S: Final = 1.0
@@ -107,7 +107,7 @@ def create_plant_app(plant: Address, allow_hosts: Collection[str] = ()) -> Starl
         with contextlib.suppress(WebSocketDisconnect):
             while True:
                 response = await links[0].request({"op": "view"})
-                await socket.send_text(response.decode() if response else "null")
+                await send(socket, response.decode() if response else "null")
                 await asyncio.sleep(VIEW_PERIOD_S)
 
     return Starlette(

@@ -21,7 +21,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from console.can_tap import load_databases
-from console.guards import STATIC, guarded, json_route, page_route
+from console.guards import STATIC, guarded, json_route, page_route, send
 from console.replay import Overview, Recording, ReplayView
 from console.server import PERIOD_S
 from console.state import describe_machine
@@ -65,7 +65,7 @@ def create_replay_app(
         with contextlib.suppress(WebSocketDisconnect, asyncio.QueueFull):
             while not hearing.done():
                 state = await asyncio.to_thread(_next, view, _waiting(orders), time.monotonic_ns())
-                await socket.send_text(json.dumps(state, separators=(",", ":")))
+                await send(socket, json.dumps(state, separators=(",", ":")))
                 await asyncio.sleep(PERIOD_S)
         hearing.cancel()
 

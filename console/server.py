@@ -45,7 +45,7 @@ from console.camera import Camera
 from console.console import Address, Console
 from console.fault_watch import FaultWatch
 from console.foxglove_server import feed_pictures
-from console.guards import STATIC, guarded, json_route, page_route
+from console.guards import STATIC, guarded, json_route, page_route, send
 from console.panel import Panel, panel_data, panels_of
 from console.plan_api import PlanApi
 from console.plant_link import TrueLogs
@@ -143,14 +143,6 @@ async def _read_timing(crane_state: CraneState, page: Path) -> None:
         await asyncio.sleep(TIMING_PERIOD_S)
 
 
-async def _send(socket: WebSocket, text: str) -> None:
-    """Send a message; raises WebSocketDisconnect when the page is gone, also if it only answers no ping any more."""
-    try:
-        await socket.send_text(text)
-    except RuntimeError as closed:  # uvicorn's word for a connection that it has closed itself
-        raise WebSocketDisconnect(1006) from closed
-
-
 async def _hear(socket: WebSocket, console: Console, page: Page | None, panel: Panel) -> None:
     """Take the answers of a page, and which panel it shows, until it is gone."""
     async with contextlib.AsyncExitStack() as looking:
@@ -173,7 +165,7 @@ def _respond(send: Callable[[], None], who: str, where: str) -> Response:
     try:
         send()
     except OSError as error:
-        return PlainTextResponse(f"The {who} at {where} cannot be reached: {error.strerror}.", 502)
+        return PlainTextResponse(f"The {who} at {where} cannot be reached: {error.strerror or error}.", 502)
     return Response(status_code=204)
 
 
@@ -308,7 +300,7 @@ def create_app(console: Console, allow_hosts: Collection[str] = ()) -> Starlette
                     sent_count, state["mission"] = mission_state.report_count, mission_state.mission()
                 if panel.due(state["sent_ms"]):
                     state |= panel_data(panel.shown, console.can_tap, console.crane_state)
-                await _send(socket, json.dumps(state, separators=(",", ":")))
+                await send(socket, json.dumps(state, separators=(",", ":")))
                 await asyncio.sleep(PERIOD_S)
             if not hearing.done():
                 await socket.close(1008, "The session has ended.")

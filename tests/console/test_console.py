@@ -11,11 +11,15 @@ import math
 import re
 import signal
 import socket
+import threading
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from starlette.websockets import WebSocketDisconnect
+from starlette.applications import Starlette
+from starlette.testclient import TestClient
+from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from autonomy.perception.log_list import decode_logs, decode_request
 from can_dbc.messages.crane import WATCH_ACTIONS, OperatorAction, OperatorCommand
@@ -28,7 +32,9 @@ from console.__main__ import _address as address_of
 from console.__main__ import main, serve_plant
 from console.console import Console
 from console.exposure import StartError
-from console.server import STATIC
+from console.plant_link import PlantLink, create_plant_app
+from console.replay_server import create_replay_app
+from console.server import STATIC, create_app
 from console.state import (
     EDGES_US,
     REPORT_TIMEOUT_NS,
@@ -45,6 +51,7 @@ from machine.status.modes import Mode
 from machine.status.stale_inputs import CRANE_INPUT_BITS, ENCODER_BIT, STALE_INPUT_NAMES
 from tests.codes import coded
 from tests.console.page_client import BROWSING, HERE, page_client, socket_of, visitor
+from tests.console.recorded_run import RecordedRun
 from tests.console.state_reports import REPORT, at
 from tests.operator_end import OperatorEnd, udp_end
 
@@ -189,6 +196,11 @@ def test_an_unreachable_controller_is_reported(console, operator_socket):
     operator_socket.close()
     answer = client_of(console).post("/api/operator/stop")
     assert answer.status_code == 502 and str(console.operator) in answer.text
+
+
+def test_a_path_too_long_for_a_socket_is_told_in_words(tmp_path):
+    answer = client_of(Console(PROFILE, 1, tmp_path / ("x" * 120))).post("/api/operator/stop")
+    assert answer.status_code == 502 and "too long" in answer.text
 
 
 def test_a_console_without_a_controller_is_read_only():
@@ -377,16 +389,32 @@ def test_machine_description_names_every_joint_once():
 # ---- the process ------------------------------------------------------------------------------------------------
 
 
-def test_a_page_that_the_server_has_given_up_counts_as_gone() -> None:
+@pytest.mark.parametrize(
+    ("app", "path"),
+    [
+        (lambda: create_app(Console(PROFILE, 1)), "/ws"),
+        (lambda: create_replay_app(RecordedRun(), PROFILE), "/ws"),
+        (lambda: create_plant_app(("127.0.0.1", 24705)), "/ws/plant"),
+    ],
+    ids=["machine", "recording", "plant"],
+)
+def test_a_page_that_the_server_has_given_up_counts_as_gone(
+    monkeypatch: pytest.MonkeyPatch, app: Callable[[], Starlette], path: str
+) -> None:
     """It answered no ping: uvicorn has closed the connection, and says so with a RuntimeError when more is sent."""
+    sent = threading.Event()
 
-    class Closed:
-        async def send_text(self, _text: str) -> None:
-            raise RuntimeError("Unexpected ASGI message 'websocket.send', after sending 'websocket.close'.")
+    async def closed(_socket: WebSocket, _text: str) -> None:
+        sent.set()
+        raise RuntimeError("Unexpected ASGI message 'websocket.send', after sending 'websocket.close'.")
 
-    with pytest.raises(WebSocketDisconnect) as gone:
-        asyncio.run(server._send(Closed(), "{}"))  # type: ignore[arg-type]
-    assert gone.value.code == 1006
+    async def answered(*_: object) -> bytes:
+        return b"{}"
+
+    monkeypatch.setattr(WebSocket, "send_text", closed)
+    monkeypatch.setattr(PlantLink, "request", answered)
+    with TestClient(app(), base_url=HERE) as page, page.websocket_connect(f"ws://127.0.0.1:8471{path}"):
+        assert sent.wait(10.0)  # and what the server raises is raised here
 
 
 @pytest.mark.parametrize("option", ["--port", "--report-port", "--foxglove"])
@@ -423,7 +451,7 @@ def test_an_address_that_takes_no_datagram_is_refused(text: str) -> None:
 
 
 def test_an_address_to_which_there_is_no_way_is_refused() -> None:
-    with pytest.raises(StartError, match=r"255\.255\.255\.255:24705 cannot be reached", check=coded("console.address")):
+    with pytest.raises(StartError, match=r"--scene .* cannot be reached", check=coded("console.address")):
         address_of("255.255.255.255:24705", "--scene")
 
 
