@@ -89,7 +89,19 @@ OURS: Final = (
         "The calibration stopped or rejected a value; such a machine drives no mission.",
         most=0.0,
     ),
-    Metric("missed", "Grasps without a log", "", "All our missions."),
+    Metric(
+        "missed",
+        "Grasps that ended with a failure",
+        "",
+        "By the machine's own word; the log may lie in the bunk all the same. All our missions.",
+    ),
+    Metric(
+        "miscounted",
+        "Logs by which the machine's count differs from the load",
+        "",
+        "Logs that it says it has loaded, less those in the bunk; sizes of the differences, summed over the missions.",
+        most=0.0,
+    ),
     Metric("mission_mean_s", "Duration of a mission, mean", "min", "From arming to the end of the route."),
     Metric("stops_mean", "Loading stops per mission, mean", "", "Paper B stops twice for every log."),
 )
@@ -125,6 +137,7 @@ BOTH: Final = tuple(
         ("mission_mean_s", "duration of the mission", "min"),
         ("stops_mean", "loading stops", ""),
         ("faults", "stops and faults", ""),
+        ("miscounted", "logs by which its count differs from the load", ""),
     )
 )
 METRICS: Final = OURS + BOTH
@@ -298,6 +311,7 @@ def mission_metrics(outcomes: Sequence[Mapping[str, Any]]) -> dict[str, float]:
     metrics |= rate("finished", len(done), len(outcomes))
     metrics["faults"] = float(sum(o["stops"] for o in outcomes))
     metrics["refused"] = float(sum(o["refused"] for o in outcomes))
+    metrics["miscounted"] = float(sum(abs(o["loaded"] - sum(log["in_bunk"] for log in o["logs"])) for o in outcomes))
     metrics["missed"] = float(sum(g.get("failure") is not None for o in outcomes for g in o["grasps"]))
     if done:
         metrics["mission_mean_s"] = float(np.mean([o["seconds"] for o in done]))

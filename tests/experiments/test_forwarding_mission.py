@@ -165,6 +165,7 @@ def test_the_missions_by_paper_b_s_method_count_together() -> None:
     missed = outcome()
     missed["logs"][0]["in_bunk"] = False
     metrics = gather({"first/ours": outcome(), "first/paper-b": outcome(), "paper-b/0": missed})
+    assert metrics["faithful.miscounted"] == 1.0 and metrics["miscounted"] == 0.0
     assert metrics["faithful.missions"] == 2.0 and metrics["first.missions"] == 1.0
     assert metrics["faithful.loaded"] == pytest.approx(5 / 6) and metrics["loaded"] == 1.0
 
