@@ -25,9 +25,8 @@ from controller.tick import Inputs
 from hil.tick.compare import kept_recordings
 from hil.tick.random_ticks import RandomTicks
 from hil.tick.worker import digest_of, recorded
-from host.compiled.build import check_tools, compile_tick
-from host.exit_codes import CommandFailed
 from runtime.compiled import SWITCH
+from tests.hil.compiled_tick import build_key
 
 DATABASES = load("crane"), load("machine"), load("gnss")
 
@@ -39,12 +38,7 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 @pytest.fixture(scope="module")
 def build() -> str:
-    """The key of a build for the present sources; compiles when there is none."""
-    try:
-        check_tools()
-    except CommandFailed as missing:
-        pytest.skip(str(missing))
-    return str(compile_tick(print)["key"])
+    return build_key()
 
 
 class Worker:
