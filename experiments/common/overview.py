@@ -154,13 +154,10 @@ def _later(results: Mapping[str, Result], links: Mapping[str, str]) -> list[str]
 
 def summary(results: Mapping[str, Result], standings: Mapping[str, Standing]) -> str:
     """Tell how many limits all experiments set, meet and miss, and how many results are of today's sources."""
-    total = sum(len(r.limits) for r in results.values())
-    missed, unsure, unmeasured, met = (
-        sum(counts)
-        for counts in zip(
-            *((len(r.missed), len(r.inconclusive), len(r.unmeasured), r.met) for r in results.values()), strict=True
-        )
-    )
+    if not results:
+        return "No experiment has a saved result."
+    judged = [(len(r.limits), r.met, len(r.missed), len(r.inconclusive), len(r.unmeasured)) for r in results.values()]
+    total, met, missed, unsure, unmeasured = map(sum, zip(*judged, strict=True))
     return (
         f"{len(results)} experiments set {total} limits: {met} are met, {missed} are missed, {unsure} are inconclusive "
         f"and {unmeasured} are not measured. {_currency(standings)}"

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments.common.overview import compared, page, read
+from experiments.common.overview import compared, page, read, summary
 from experiments.common.published import COMPARISONS
 from experiments.common.registry import EXPERIMENTS, Options
 from experiments.common.result_page import Page, conclusion, markdown
@@ -41,6 +41,12 @@ def test_missed_and_inconclusive_limits_are_not_met_and_paper_values_are_shown()
     ((_, (*_, kept, _, _)),) = compared({"navigation": replace(NAVIGATION, missed=())})
     ((_, (*_, worse, _, _)),) = compared({"navigation": replace(NAVIGATION, missed=("heading_deg_per_m",))})
     assert worse != kept and numbers_in(worse) == numbers_in(kept), "and so it is said beside the paper's"
+
+
+def test_without_saved_results_the_overview_says_so() -> None:
+    """`report --docs` with an empty folder ended in a traceback."""
+    text = page({}, (), {})
+    assert summary({}, {}) in text and not numbers_in(summary({}, {})) and "\n| [" not in text
 
 
 def test_a_limit_without_a_figure_is_not_met_and_its_sentence_is_left_out() -> None:
