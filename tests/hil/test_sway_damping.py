@@ -15,7 +15,8 @@ from tests.hil.swinging_grapple import SHIPPED, sensing_profile, stop_at
 
 pytestmark = pytest.mark.long
 
-GOAL_M = (4.27, 1.86, 1.0)
+GOAL_M = (4.6, 2.0, 1.4)
+"""The way there leads clear over the stakes."""
 PERIOD_S = 1.8
 CUT_S = 1.0
 
