@@ -125,7 +125,7 @@ def main() -> int:
     parser.add_argument("--run", type=Path, required=True, metavar="DIR", help="directory of the live run")
     parser.add_argument("--socket", type=Path, required=True, metavar="FILE", help="socket to serve at")
     a = parser.parse_args()
-    signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGINT))
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # also where a shell started it with SIGINT ignored
     try:
         with Desk(a.socket, a.run) as desk:
             print(json.dumps({"ready": True}), flush=True)
