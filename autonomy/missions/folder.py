@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -60,12 +61,16 @@ class MissionFolder:
             MissionError: a bad name, a file of this name although ``replace`` is False, or the disk refuses.
         """
         path = self._file(name)
-        draft = path.with_name(f".{name}.{os.getpid()}")
+        draft: Path | None = None
         try:
             if not self.path.is_dir():
                 self.path.mkdir(parents=True)
-            draft.write_bytes(data)
-            draft.chmod(FILE_MODE)
+            with tempfile.NamedTemporaryFile(prefix=".mission.", dir=self.path, delete=False) as file:
+                draft = Path(file.name)
+                file.write(data)
+                os.fchmod(file.fileno(), FILE_MODE)
+                file.flush()
+                os.fsync(file.fileno())  # a rename may reach the disk before the bytes do
             if replace:
                 draft.replace(path)
             else:
@@ -78,8 +83,9 @@ class MissionFolder:
         except OSError as error:
             raise MissionError("missions.not-written", f"cannot be written: {error.strerror}", name) from None
         finally:
-            with contextlib.suppress(OSError):  # a folder that may not be entered holds no draft
-                draft.unlink(missing_ok=True)
+            if draft is not None:
+                with contextlib.suppress(OSError):
+                    draft.unlink(missing_ok=True)
 
     def _file(self, name: str) -> Path:
         if not FILE_NAME.fullmatch(name):

@@ -204,8 +204,8 @@ def decode_mission(data: bytes, key: bytes | None = None) -> tuple[int, int, Mis
 # refused in ``refusal`` and ``refusal_code``, and also goes to the sender.
 
 DIGEST_BYTES: Final = 32
-FILE_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9 _.-]{0,59}\.geojson")
-"""Names of missions in the folder: no separators, no leading dot."""
+FILE_NAME: Final = re.compile(r"[^\W_][\w .-]{0,59}\.geojson")
+"""Names of missions in the folder: letters of any language, no separators, no leading dot."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,9 @@ import pytest
 from starlette.testclient import TestClient
 
 from autonomy.missions.export import FORMATS
+from autonomy.missions.folder import MissionFolder
 from autonomy.missions.mission_file import load_mission
+from autonomy.missions.model import MissionError
 from can_dbc.messages.mission import decode_mission_upload, encode_mission
 from console.console import Console
 from console.plan_api import MAX_BODY_BYTES
@@ -135,16 +137,35 @@ def test_what_is_exported_is_imported_again(client: TestClient) -> None:
     assert client.post("/api/plan/export/dxf", json=document()).json()["code"] == "mission.export-format"
 
 
-def test_missions_are_saved_in_the_folder_alone(client: TestClient, tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["stand 12.geojson", "Süd-Wald Ødegård 12.geojson"])
+def test_missions_are_saved_in_the_folder_alone(client: TestClient, name: str, tmp_path: Path) -> None:
     folder = tmp_path / "missions"
     assert client.get("/api/plan/missions").json() == []
-    assert client.post("/api/plan/missions/stand 12.geojson", json=document()).status_code == 200
-    assert client.get("/api/plan/missions").json() == ["stand 12.geojson"]
-    assert client.get("/api/plan/missions/stand 12.geojson").json()["mission"] == document()
-    again = client.post("/api/plan/missions/stand 12.geojson", json=document(name="b"))
+    assert client.post(f"/api/plan/missions/{name}", json=document()).status_code == 200
+    assert client.get("/api/plan/missions").json() == [name]
+    assert client.get(f"/api/plan/missions/{name}").json()["mission"] == document()
+    again = client.post(f"/api/plan/missions/{name}", json=document(name="b"))
     assert again.json()["code"] == "missions.exists"
-    assert client.post("/api/plan/missions/stand 12.geojson?replace=1", json=document(name="b")).status_code == 200
-    assert load_mission(folder / "stand 12.geojson").mission.name == "b"
+    assert client.post(f"/api/plan/missions/{name}?replace=1", json=document(name="b")).status_code == 200
+    assert load_mission(folder / name).mission.name == "b"
+    assert [file.name for file in folder.iterdir()] == [name]
+
+
+def test_two_requests_that_save_the_same_mission_at_once_do_not_mix(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, link = MissionFolder(tmp_path), os.link
+
+    def overtaken(draft: Path, path: Path) -> None:
+        monkeypatch.setattr(os, "link", link)
+        folder.write("m.geojson", b"the other's")
+        link(draft, path)
+
+    monkeypatch.setattr(os, "link", overtaken)
+    with pytest.raises(MissionError) as refused:
+        folder.write("m.geojson", b"the first's")
+    assert refused.value.code == "missions.exists"
+    assert folder.read("m.geojson") == b"the other's" and len(os.listdir(tmp_path)) == 1
 
 
 @pytest.mark.parametrize(
