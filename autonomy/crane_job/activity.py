@@ -80,6 +80,8 @@ class ActivityState:
         self._counts = has_no_encoder(profile)
         self._machine, self._profile = profile, planning_profile(profile, self._count)
         self._view, self._viewed = view, False
+        self.has_released = False
+        """Whether a job that failed had already released its logs at their place: only the way up was not done."""
         self.load_unseen = False
         """Whether a load was held before the camera and no picture showed it."""
         self._first = Phase.STOW if stow_only else Phase.LOOK
@@ -169,6 +171,8 @@ class ActivityState:
             self._fail(Problem("activity.aborted", reason))
 
     def _fail(self, problem: Problem) -> None:
+        retreats = self.phase is Phase.RETREAT and problem.code != KEPT.code
+        self.has_released = retreats and self._cycle.misplaced_log() is None
         self._failure = problem
         self.phase = Phase.FAILED
         self._elapsed_s = 0.0
@@ -268,8 +272,9 @@ class Activity(ActivityState):
         self._arrived_ns = self._ready_ns = self._restart_phase = None
         closing_s = self._grapple.start_following() if phase is Phase.CLOSE else 0.0
         self._viewed = False
-        view = self._view if phase is Phase.LIFT else None
+        view = self._view if phase is Phase.LIFT and not self._cycle.is_bundle else None
         self._cycle.view = view if view and view.is_needed(self.rotator, start[Joint.SLEW]) else None
+        self.load_unseen = self.load_unseen and phase is not Phase.LIFT
         try:
             self._tracker.begin(self._cycle.plan(phase, start, closing_s))
         except (Unreachable, NoGrasp) as error:
@@ -350,6 +355,10 @@ class Activity(ActivityState):
             self._enter(following, self._tracker.setpoint)
         elif self._elapsed_s > _TIMEOUT_FACTOR * self.motion.duration_s + rule.settle_s + rule.slack_s:
             if self.phase is Phase.LOOK and self._look_aside():
+                return
+            if self.phase is Phase.OPEN and self._may_have_released:
+                self._cycle.tests_release = True
+                self._enter(Phase.RETREAT, self._tracker.setpoint)
                 return
             off = self._tracker.worst_joint(self._position())
             self._fail(rule.timeout._replace(sentence=f"{rule.timeout.sentence} within {self._elapsed_s:.0f} s{off}"))
@@ -474,6 +483,14 @@ class Activity(ActivityState):
         if self._inbox.logs_ns < self._ready_ns:
             return None
         return self._after_release() if self._sees_next else Phase.RETREAT
+
+    @property
+    def _may_have_released(self) -> bool:
+        """Whether jaws without a sensor, which something kept from opening, may have let go all the same: the load cell
+        tells once they have risen.
+        """
+        lays_down = not (self._put_back_reason or self._cycle.drops_load)
+        return self._direct and lays_down and self._grapple.opens_unseen
 
     def _after_retreat(self, now_ns: int) -> Phase | None:
         """Be done, or open the jaws again and higher, where they have taken the load along."""

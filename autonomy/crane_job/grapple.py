@@ -219,9 +219,14 @@ class GrappleSequence:
         return self.laden_kg > _RESTING_FROM_KG and self._resting_s > _RESTING_S
 
     @property
+    def opens_unseen(self) -> bool:
+        """Whether no sensor tells how far the jaws have opened."""
+        return not isfinite(self._inbox.report.opening_pct)
+
+    @property
     def may_keep_load(self) -> bool:
         """Whether only the load cell can tell that the jaws have released it: they have no sensor, and it is heavy."""
-        return not isfinite(self._inbox.report.opening_pct) and self.laden_kg > _RESTING_FROM_KG
+        return self.opens_unseen and self.laden_kg > _RESTING_FROM_KG
 
     @property
     def has_kept_load(self) -> bool:

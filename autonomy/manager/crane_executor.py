@@ -182,7 +182,7 @@ class CraneExecutor:
     def collected(self, now_ns: int) -> bool:
         """Tell whether a grasp was placed in the bunk; if so, end the job and book the logs."""
         job = self.job
-        if job is None or not job.idle or not job.done or job.grasp is None:
+        if job is None or not job.idle or job.grasp is None or not (job.done or job.has_released):
             return False
         self._load.book_loaded(job, now_ns)
         if job.load_unseen:

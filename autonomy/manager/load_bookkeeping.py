@@ -185,6 +185,12 @@ class LoadBookkeeping:
             self._remark_grip(job.grasp.logs, grip, now_ns)
         loaded_logs = [self._loaded_log(log, now_ns) for log in logs]
         self.tally.book_loaded(loaded_logs)
+        if job.failure is not None:
+            self.tally.remark(
+                now_ns,
+                f"log {' and '.join(str(log.id) for log in logs)} was released into the bunk and counts as loaded, but "
+                f"the crane did not rise from it: {job.failure}",
+            )
         self._booked_ns = now_ns
         self.sorting.book_loaded(log.assortment for log in loaded_logs)
 
@@ -247,7 +253,7 @@ class LoadBookkeeping:
         fallen_logs = [log for log in self._fallen.fallen(world.log_map.logs) if not world.is_on_landing(log)]
         lost = fallen_logs[: tally.on_board]
         for log in lost:
-            tally.book_lost(1)
+            self._book_lost(1)
             tally.remark(
                 now_ns,
                 f"log {log.number} lies where the loaded machine has been: it fell off; {tally.on_board} are on board, "
@@ -263,7 +269,7 @@ class LoadBookkeeping:
             tally.remark(now_ns, f"{more} in the bunk than was gripped on purpose; {tally.on_board} are on board")
             return
         on_board = min(-difference, tally.on_board)
-        tally.book_lost(on_board)
+        self._book_lost(on_board)
         assert self._from_before is not None
         self._from_before += difference + on_board
         tally.remark(
@@ -271,6 +277,12 @@ class LoadBookkeeping:
             f"{'a log was' if one else f'{-difference} logs were'} lost between {self._agreed_m:.0f} m and "
             f"{driven_m:.0f} m of the drive; {tally.on_board} are on board; what was lost is looked for again",
         )
+
+    def _book_lost(self, count: int) -> None:
+        """Book lost logs; the landing of a load of which nothing is left is undecided again."""
+        self.tally.book_lost(count)
+        if not self.tally.on_board:
+            self.sorting.book_unloaded()
 
     def _loaded_log(self, log: LogObservation, now_ns: int) -> LoadedLog:
         """Remove a grasped log from the map and return it with the place where it had lain."""
@@ -303,7 +315,7 @@ class LoadBookkeeping:
         """Book a finished grasp from the bunk; return whether it failed."""
         failed = job.failure is not None
         self.tally.missed += failed
-        if job.done and job.grasp is not None:
+        if (job.done or job.has_released) and job.grasp is not None:
             self.tally.book_unloaded(len(job.grasp.logs))
         return failed
 

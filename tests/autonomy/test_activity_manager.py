@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from autonomy.crane_job.activity import KEPT
+from autonomy.crane_job.phases import Phase
 from autonomy.grasp.bunk_load import lies_in_bunk, plan_place
 from autonomy.grasp.planner import BunkFull
 from autonomy.manager.activity_manager import MAX_OUTSIDE_M, ActivityManager
@@ -389,6 +390,20 @@ def test_a_log_in_the_jaws_is_laid_down_after_three_stops() -> None:
     forwarder.run(manager, ended)
     assert manager.state is State.DONE and forwarder.crane.held is None
     assert (manager.tally.missed, len(manager.tally.given_up)) == (0, 0) and manager.tally.on_board == 1
+
+
+@whole
+def test_a_log_in_the_bunk_counts_although_the_crane_is_stopped_while_it_rises() -> None:
+    forwarder, manager = begin(LOGS[:1], OURS)
+    forwarder.run(manager, lambda m: ended(m) or (m.activity is not None and m.activity.phase is Phase.RETREAT))
+    for _ in range(MAX_STOPS):
+        forwarder.steps(manager, 2)
+        stop_and_arm(forwarder, manager)
+    forwarder.run(manager, ended)
+    assert forwarder.in_bunk == manager.tally.loaded == manager.tally.on_board == 1
+    assert (manager.tally.missed, len(manager.tally.given_up)) == (0, 0)
+    (remark,) = manager.tally.remarks
+    assert numbers_in(remark.text)[-1] == MAX_STOPS
 
 
 def test_paper_b_drives_on_when_the_log_is_not_detected_again() -> None:

@@ -377,6 +377,22 @@ def test_a_log_that_the_opened_jaws_take_along_is_released_higher(free_m: float,
     assert (crane.held is None) == (code is None) and lies_in_bunk(PROFILE.bunk, crane.logs[0])
 
 
+@pytest.mark.parametrize(
+    ("feedback", "free_m", "code"),
+    [(False, -1.0, None), (False, 5.0, "activity.log-kept"), (True, -1.0, "activity.open-timeout")],
+)
+def test_jaws_that_something_keeps_from_opening_rise_where_only_the_load_cell_tells(
+    feedback: bool, free_m: float, code: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its log lay in the bunk, and the job ended as a missed grasp."""
+    crane = Hooking(PROFILE, [GROUND_LOG], feedback=feedback, log_kg=90.0, free_m=free_m)
+    planner = activity(fetches_next=lambda log: True)
+    crane.until(planner, Phase.OPEN)
+    monkeypatch.setattr(planner._grapple, "has_released", lambda *_: False)
+    crane.run(planner)
+    assert (planner.failure_code, planner.done) == (code, code is None) and not planner.has_released
+
+
 @dataclass
 class Remembering(StandIn):
     """A crane whose camera looks while it rests, shows only what lies near the pin, not what hangs under it, and

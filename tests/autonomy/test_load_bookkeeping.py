@@ -56,7 +56,7 @@ class Hands:
         self.memory, self.field, self.now_ns = LogMemory(PROFILE), field, 0
         self.load_kg = math.nan
         self.grasp = grasp_of(field.logs[:meant])
-        self.job: Any = SimpleNamespace(grasp=self.grasp, phase=Phase.LOOK)
+        self.job: Any = SimpleNamespace(grasp=self.grasp, phase=Phase.LOOK, failure=None)
         self.to(self.grasp.pose)
 
     def to(self, pose: Pose) -> None:
@@ -270,7 +270,7 @@ class Books:
     def book(self, *diameters_m: float) -> None:
         logs = [replace(lying(7 + i, -4.0, 3.0 + i, 0.0), diameter_m=d) for i, d in enumerate(diameters_m)]
         self.now_ns += PERIOD_NS
-        self.load.book_loaded(SimpleNamespace(grasp=grasp_of(logs)), self.now_ns)
+        self.load.book_loaded(SimpleNamespace(grasp=grasp_of(logs), failure=None), self.now_ns)
 
     def look(self, in_bunk: int, times: int = LOOKS, driven_m: float = 5.0) -> None:
         for _ in range(times):
@@ -434,16 +434,19 @@ def test_nothing_falls_where_the_machine_has_not_been_or_out_of_an_empty_bunk() 
     assert not fallen.fallen([log])
 
 
-def test_a_log_that_fell_off_is_booked_and_said() -> None:
+@pytest.mark.parametrize(("loaded", "landing"), [(3, 1), (1, None)])
+def test_a_log_that_fell_off_is_booked_and_said(loaded: int, landing: int | None) -> None:
+    """A load of which nothing is left goes nowhere: logs of other landings were never loaded again."""
     books = Books()
     load = books.load
-    load.tally.book_loaded([LoadedLog(Point(0.0, 0.0), 1, 0.1)] * 3)
+    load.tally.book_loaded([LoadedLog(Point(0.0, 0.0), 1, 0.1)] * loaded)
+    load.sorting.landing = 1
     for x_m in range(20):
         books.world.base = base(float(x_m), 0.0, math.pi)
         assert load.check_fallen(x_m) == 0
     books.field.restore(seen_often(1, 8.0, 1.4))
     assert load.check_fallen(30) == 1 and load.check_fallen(31) == 0
     tally = load.tally
-    assert (tally.loaded, tally.on_board) == (2, 2)
+    assert (tally.loaded, tally.on_board) == (loaded - 1, loaded - 1) and load.sorting.landing == landing
     (remark,) = tally.remarks
     assert remark.at_ns == 30 and 1 in numbers_in(remark.text)

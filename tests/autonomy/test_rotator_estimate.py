@@ -27,6 +27,8 @@ from autonomy.crane_job.rotator_estimate import (
     planning_profile,
 )
 from autonomy.grasp.bunk_load import lies_in_bunk
+from autonomy.grasp.planner import Grasp
+from autonomy.grasp.selection import select_direct
 from autonomy.motion.arm_kinematics import Arm, Pose
 from autonomy.perception.camera.frame import optical_pose
 from autonomy.perception.log_list import LogObservation
@@ -196,6 +198,17 @@ def test_a_load_that_no_picture_shows_is_laid_down_all_the_same_and_said() -> No
     planner = activity(profile=FORWARDER, view=load_view(FORWARDER, 0.0))
     crane.run(planner)
     assert planner.done and planner.load_unseen, planner.failure
+
+
+def test_a_bundle_is_not_held_before_the_camera_and_nobody_waits_for_its_picture() -> None:
+    def bundle(*told) -> Grasp:
+        grasp = select_direct(*told)
+        return replace(grasp, top_z_m=grasp.log.center_m[2] + 0.125)
+
+    crane = Blind(FORWARDER, [birch(0)], q=HOME)
+    planner = activity(profile=FORWARDER, view=load_view(FORWARDER, 0.0), grasp_selector=bundle)
+    crane.run(planner)
+    assert planner.done and planner.grasp.is_bundle and not planner.load_unseen, planner.failure
 
 
 def test_a_turn_there_and_back_does_not_end_where_it_began() -> None:
