@@ -28,6 +28,7 @@ from autonomy.crane_job.rotator_estimate import (
     load_in_view,
     planning_profile,
     rotator_angle_of_hanging_log,
+    view_sigma_rad,
 )
 from autonomy.crane_job.trajectory_tracker import BRAKE_S, TrajectoryTracker
 from autonomy.grasp.grapple_heights import VERIFY_LIFT_M
@@ -84,6 +85,8 @@ class ActivityState:
         """Whether a job that failed had already released its logs at their place: only the way up was not done."""
         self.load_unseen = False
         """Whether a load was held before the camera and no picture showed it."""
+        self.judged_by_picture = False
+        """Whether only a picture can tell that the load hangs in the jaws: it is too light to weigh, and is shown."""
         self._first = Phase.STOW if stow_only else Phase.LOOK
         self._fetches_next = fetches_next
         motion_planner = motion_planner or TimeOptimalPlanner()
@@ -125,6 +128,11 @@ class ActivityState:
     def done(self) -> bool:
         """Whether the log lies in the bunk and the crane is clear of it."""
         return self.phase is Phase.DONE
+
+    @property
+    def load_missing(self) -> bool:
+        """Whether a load that is too light to weigh was held before the camera, and no picture showed it."""
+        return self.judged_by_picture and self.load_unseen
 
     @property
     def arrived(self) -> bool:
@@ -216,8 +224,8 @@ class Activity(ActivityState):
         stow_only: fetch no log, but move over the bunk with the present load so that the machine may drive.
         rotator: the estimate of earlier jobs for a rotator without an encoder; holds the newest estimate afterwards.
         slope: how the machine stands, see `autonomy.motion.arm_kinematics`; level by default.
-        view: the camera to which a load is shown while the rotator's angle is unsure, because the log list only
-            remembers; None where pictures show the load at work.
+        view: the camera to which a load is shown while the rotator's angle is unsure, or because it is too light to
+            weigh, for the log list only remembers; None where pictures show the load at work.
     """
 
     # ------------------------------------------------------------------ one tick
@@ -272,11 +280,14 @@ class Activity(ActivityState):
         self._arrived_ns = self._ready_ns = self._restart_phase = None
         closing_s = self._grapple.start_following() if phase is Phase.CLOSE else 0.0
         self._viewed = False
-        view = self._view if phase is Phase.LIFT and not self._cycle.is_bundle else None
-        self._cycle.view = view if view and view.is_needed(self.rotator, start[Joint.SLEW]) else None
-        self.load_unseen = self.load_unseen and phase is not Phase.LIFT
+        view = self._view if phase is Phase.LIFT and self._direct and not self._cycle.is_bundle else None
+        light = self._cycle.is_too_light
+        needed = view is not None and (light or view.is_needed(self.rotator, start[Joint.SLEW]))
+        self._cycle.view = view if needed else None
         try:
             self._tracker.begin(self._cycle.plan(phase, start, closing_s))
+            if phase is Phase.LIFT:
+                self.load_unseen, self.judged_by_picture = False, light and self._cycle.view is not None
         except (Unreachable, NoGrasp) as error:
             self._tracker.begin(hold(start))
             self.bunk_full = isinstance(error, BunkFull)
@@ -574,15 +585,22 @@ class Activity(ActivityState):
         load = load_in_view(self._cycle.arm, logs, self._cycle.arm.pose(q))
         if load is None or not self.shows_load:
             return None
+        if self._counts:
+            self._correct_count(load, q[Joint.SLEW])
+        self._arrived_ns, self._viewed = self._last_ns, True  # the way on needs a list that remembers the load so
+        return load
+
+    def _correct_count(self, load: LogObservation, slew_rad: float) -> None:
+        """Correct the rotator by the direction of a load that a picture shows, and plan anew with it."""
+        assert self.grasp is not None
         counts = self._count.to_counts(self._tracker.setpoint)
-        stands = rotator_angle_of_hanging_log(self._profile, load, q[Joint.SLEW])
-        self.rotator = self._count = self.rotator.corrected(counts[Joint.ROT], stands)
+        stands = rotator_angle_of_hanging_log(self._profile, load, slew_rad)
+        sigma_rad = view_sigma_rad(self.grasp.thinnest_m)
+        self.rotator = self._count = self.rotator.corrected(counts[Joint.ROT], stands, sigma_rad)
         self._tracker.begin(hold(self._count.to_angles(counts)))
         # A rotator that proves slower than its count takes a faster count for the same turn: plan slower turns.
         self._profile = planning_profile(self._machine, self._count)
         self._cycle.plan_for(self._profile)
-        self._arrived_ns, self._viewed = self._last_ns, True  # the way on needs a list that remembers the load so
-        return load
 
     def _follow_rotator(self) -> None:
         """Add what the rotator is told to turn to its estimates."""

@@ -43,7 +43,7 @@ from autonomy.crane_job.rotator_estimate import LoadView, has_no_encoder
 from autonomy.grasp.bunk_load import lies_in_bunk, plan_place
 from autonomy.grasp.grapple_heights import VERIFY_LIFT_M, retreat_height_m, travel_height_m
 from autonomy.grasp.planner import Grasp, GraspSelector, NoGrasp
-from autonomy.grasp.weight import bearable_kg
+from autonomy.grasp.weight import bearable_kg, is_weighable
 from autonomy.missions.crane_job import CraneJob
 from autonomy.motion.arm_kinematics import LEVEL, Arm, Pose
 from autonomy.motion.motion_planner import MotionPlanner
@@ -168,6 +168,13 @@ class Cycle:
     def is_bundle(self) -> bool:
         """Whether the grasp is a bundle: its logs settle when it is lifted, and the jaws follow."""
         return self.grasp is not None and self.grasp.is_bundle
+
+    @property
+    def is_too_light(self) -> bool:
+        """Whether the load cell cannot tell that the logs of the grasp hang in the jaws; logs from a bunk are left out,
+        for nobody counts them by the grasp.
+        """
+        return self.grasp is not None and self._job.source is None and not is_weighable(self.grasp.logs)
 
     def select_grasp(self, q: Axes) -> None:
         """Select a grasp among the logs of the newest list, from the present joints; raises ``NoGrasp``."""

@@ -17,6 +17,7 @@ from typing import Final
 import numpy as np
 from msgspec.structs import replace
 
+from autonomy.crane_job.grapple import THICK_LOG_M
 from autonomy.crane_job.grasp_verification import is_between_jaws
 from autonomy.grasp.grapple_heights import travel_height_m
 from autonomy.motion.arm_kinematics import Arm, Pose
@@ -36,6 +37,8 @@ TURN_SIGMA_RAD: Final = 0.04
 """1-sigma of what a turn of 1 rad adds that the next one does not: dead-band, load and oil differ."""
 VIEW_SIGMA_RAD: Final = 0.08
 """1-sigma of a viewed angle: a log may hang a little askew, and its axis is measured to 4 degrees."""
+THIN_SIGMA_RAD: Final = 0.35
+"""The same of a thin log: it may lie askew in closed jaws (0.5 rad were seen), whatever the rotator does."""
 SCALE_BOUNDS: Final = (0.6, 1.5)
 ROUNDING_RAD: Final = 1e-9
 
@@ -91,11 +94,14 @@ class RotatorEstimate:
         aa += TURN_SIGMA_RAD**2 * abs(turn)
         return RotatorEstimate(sent_rad, self.angle(sent_rad), self.paces, (aa, an, ap, nn, np, pp))
 
-    def corrected(self, sent_rad: float, angle_rad: float) -> RotatorEstimate:
-        """Return the estimate after the rotator was viewed at an angle, modulo pi, at this count."""
+    def corrected(self, sent_rad: float, angle_rad: float, sigma_rad: float = VIEW_SIGMA_RAD) -> RotatorEstimate:
+        """Return the estimate after the rotator was viewed at an angle, modulo pi, at this count.
+
+        ``sigma_rad``: 1-sigma of the view.
+        """
         now = self.turned(sent_rad)
         aa, an, ap, nn, np, pp = now.covariance
-        off, spread = remainder(angle_rad - now.angle_rad, pi), aa + VIEW_SIGMA_RAD**2
+        off, spread = remainder(angle_rad - now.angle_rad, pi), aa + sigma_rad**2
         # A grapple turned by pi looks the same: keep the estimate near the count and within its range.
         near = sent_rad + remainder(now.angle_rad + aa / spread * off - sent_rad, pi)
         least, most = SCALE_BOUNDS
@@ -172,6 +178,11 @@ def rotator_angle_of_hanging_log(profile: Profile, log: LogObservation, slew_rad
     return atan2(log.axis[1], log.axis[0]) + pi / 2 - straight
 
 
+def view_sigma_rad(thinnest_m: float) -> float:
+    """Return the 1-sigma of a rotator that is viewed by its load: a thin log may lie askew in the jaws."""
+    return VIEW_SIGMA_RAD if thinnest_m >= THICK_LOG_M else THIN_SIGMA_RAD
+
+
 # -- Shows a load to the camera ahead of the machine, so that a rotator without an encoder is measured.
 #
 # The crane works from memory of what that camera has seen, and a remembered load hangs as the count says.  So the
@@ -205,8 +216,9 @@ class LoadView:
     articulation_rad: float
 
     def is_needed(self, rotator: RotatorEstimate, slew_rad: float) -> bool:
-        """Tell whether a load gripped at this slew should be shown."""
-        return rotator.sigma_rad > (UNSURE_AHEAD_RAD if abs(slew_rad) > AHEAD_RAD else UNSURE_RAD)
+        """Tell whether a load gripped at this slew should be shown for the rotator's sake."""
+        unsure_rad = UNSURE_AHEAD_RAD if abs(slew_rad) > AHEAD_RAD else UNSURE_RAD
+        return has_no_encoder(self.profile) and rotator.sigma_rad > unsure_rad
 
     def pose(self, arm: Arm, start: Pose, diameter_m: float) -> Pose:
         """Find the pose of the pin in which a load hangs in front of the camera, across its view and nearest to
@@ -242,8 +254,6 @@ def load_in_view(arm: Arm, logs: Iterable[LogObservation], pin: Pose) -> LogObse
 
 
 def load_view(profile: Profile, articulation_rad: float) -> LoadView | None:
-    """Return the view of the machine's camera ahead; None where it has none, or needs none for it has an encoder."""
+    """Return the view of the machine's camera ahead; None where it has none."""
     camera = next((c for c in profile.cameras.values() if c.link in VEHICLE_LINKS), None)
-    if camera is None or not has_no_encoder(profile):
-        return None
-    return LoadView(profile, camera, articulation_rad)
+    return None if camera is None else LoadView(profile, camera, articulation_rad)

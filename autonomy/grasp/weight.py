@@ -15,6 +15,10 @@ from autonomy.perception.log_list import LogObservation
 from machine.joints import Joint
 from machine.sensing import bearable_load_kg
 
+GREEN_KG_M3: Final = 900.0
+"""Density of green wood (birch 850 to 950, `docs/reference/machines.md`)."""
+UNSURE_KG: Final = 30.0
+"""Two sigmas of the scale (`autonomy.manager.load_detector`): a lighter load cannot be told from none."""
 HEAVIER: Final = 1.15
 """A log by its measured size may weigh so much more: wet wood, and 3 cm of 40."""
 HEAP_HEAVIER: Final = 1.5
@@ -25,6 +29,16 @@ than this times what was seen of them, up to 2.4 times; the lift watches its loa
 def wood_kg(logs: Iterable[LogObservation]) -> float:
     """Compute the weight of logs by their measured sizes [kg]."""
     return sum(DENSITY_KG_M3 * pi * (log.diameter_m / 2.0) ** 2 * log.length_m for log in logs)
+
+
+def green_kg(log: LogObservation) -> float:
+    """Estimate the weight of a log of green wood by its size."""
+    return GREEN_KG_M3 * pi * (log.diameter_m / 2.0) ** 2 * log.length_m
+
+
+def is_weighable(logs: Iterable[LogObservation]) -> bool:
+    """Tell whether the scale can tell these logs from none."""
+    return sum(map(green_kg, logs)) >= UNSURE_KG
 
 
 def bearable_kg(arm: Arm, q: Sequence[float]) -> float:

@@ -17,6 +17,7 @@ from autonomy.crane_job.phases import Phase
 from autonomy.crane_job.rotator_estimate import LoadView, RotatorEstimate, load_view
 from autonomy.grasp.bunk_load import lies_in_bunk
 from autonomy.grasp.planner import Grasp, GraspSelector
+from autonomy.grasp.weight import UNSURE_KG
 from autonomy.manager.load_bookkeeping import LoadBookkeeping
 from autonomy.manager.log_memory import LogMemory
 from autonomy.manager.world_model import WorldModel
@@ -42,8 +43,8 @@ class CraneExecutor:
 
     ``selector`` picks grasps on the ground, ``unloading_selector`` those from the bunk.  ``rotator`` is the known state
     of a rotator without an encoder.  ``log_memory``: the camera only looks ahead; a load is shown to it while the
-    rotator is unsure, and remembered as it was seen.  ``as_paper_b`` works as paper B does: a grasp takes only its
-    target, gives it up after one failure, and ends over the bunk.
+    rotator is unsure, or where it is too light to weigh, and remembered as it was seen.  ``as_paper_b`` works as paper
+    B does: a grasp takes only its target, gives it up after one failure, and ends over the bunk.
     """
 
     def __init__(
@@ -182,7 +183,9 @@ class CraneExecutor:
     def collected(self, now_ns: int) -> bool:
         """Tell whether a grasp was placed in the bunk; if so, end the job and book the logs."""
         job = self.job
-        if job is None or not job.idle or job.grasp is None or not (job.done or job.has_released):
+        if job is None or not job.idle or job.grasp is None or self._came_up_empty(job):
+            return False
+        if not (job.done or job.has_released):
             return False
         self._load.book_loaded(job, now_ns)
         if job.load_unseen:
@@ -194,14 +197,26 @@ class CraneExecutor:
         self._end(job)
         return True
 
-    def missed(self, target: int | None) -> bool:
-        """Tell whether a grasp failed; if so, end the job and give the log up after too many failures."""
+    def missed(self, now_ns: int, target: int | None) -> bool:
+        """Tell whether a grasp failed, or nothing has shown its load; if so, end the job and give the log up after too
+        many failures.
+        """
         job = self.job
-        if job is None or not job.idle or job.failure is None:
+        if job is None or not job.idle or (job.failure is None and not self._came_up_empty(job)):
             return False
-        self._load.book_miss(job, target, for_good=self._as_paper_b)
+        if job.failure is not None:
+            self._load.book_miss(job, target, for_good=self._as_paper_b)
+        else:
+            assert self._log_memory is not None
+            self._load.book_unseen(job, now_ns)
+            self._log_memory.leave()
         self._end(job)
         return True
+
+    def _came_up_empty(self, job: Activity) -> bool:
+        """Tell whether neither a picture nor the scale has shown a load that was thought to hang in the jaws."""
+        grip = self._world.grip
+        return job.load_missing and not (grip is not None and grip.read_kg >= UNSURE_KG)
 
     def unloaded(self) -> bool:
         """Tell whether a grasp from the bunk is over, with or without logs; if so, end the job."""

@@ -64,7 +64,7 @@ class EventConditions:
             case Event.COLLECTED:
                 return self._crane.collected(now_ns)
             case Event.MISSED:
-                return self._crane.missed(self._target.number)
+                return self._crane.missed(now_ns, self._target.number)
             case Event.LOADED:
                 return self._load.loaded and (self._load.full or self._route.ended)
             case Event.EMPTY:

@@ -11,8 +11,8 @@ from typing import Final
 import numpy as np
 
 from autonomy.crane_job.activity import Activity
+from autonomy.grasp.weight import UNSURE_KG, green_kg
 from autonomy.manager.checkpoint import Checkpoint, copied_tally
-from autonomy.manager.load_detector import expected_kg
 from autonomy.manager.log_map import MappedLog
 from autonomy.manager.log_memory import Grip
 from autonomy.manager.tally import LoadedLog, Tally, volume_m3
@@ -98,8 +98,6 @@ class FallenLogs:
 
 LOOKS: Final = 4
 """Log lists in a row, a second of them, that must show the same number of logs in the bunk before it is believed."""
-UNSURE_KG: Final = 30.0
-"""Two sigmas of the scale (`autonomy.manager.load_detector`): a lighter load cannot be told from none."""
 
 
 class LoadBookkeeping:
@@ -182,7 +180,7 @@ class LoadBookkeeping:
         logs = job.grasp.logs
         if grip is not None:
             logs = (*(log for log in logs if log.id not in grip.left), *grip.also)
-            self._remark_grip(job.grasp.logs, grip, now_ns)
+            self._remark_grip(job.grasp.logs, grip, now_ns, job.judged_by_picture)
         loaded_logs = [self._loaded_log(log, now_ns) for log in logs]
         self.tally.book_loaded(loaded_logs)
         if job.failure is not None:
@@ -194,8 +192,10 @@ class LoadBookkeeping:
         self._booked_ns = now_ns
         self.sorting.book_loaded(log.assortment for log in loaded_logs)
 
-    def _remark_grip(self, logs: Sequence[LogObservation], grip: Grip, now_ns: int) -> None:
-        """Say where the weight in the grapple differs from what was meant, or cannot tell, and what lies high."""
+    def _remark_grip(self, logs: Sequence[LogObservation], grip: Grip, now_ns: int, is_seen: bool) -> None:
+        """Say where the weight in the grapple differs from what was meant, or cannot tell where nothing else does, and
+        what lies high.
+        """
         names = " and ".join(str(log.id) for log in logs)
         for log in grip.also:
             self.tally.remark(
@@ -213,8 +213,8 @@ class LoadBookkeeping:
                 f"log {number} was laid down as high as the stakes, where no camera looks: it may lie above them; look "
                 "at the load before the machine drives on",
             )
-        weight_kg = sum(expected_kg(log) for log in logs)
-        if not grip.left and weight_kg < UNSURE_KG:
+        weight_kg = sum(green_kg(log) for log in logs)
+        if not grip.left and weight_kg < UNSURE_KG and not is_seen:
             self.tally.remark(
                 now_ns,
                 f"log {names} weighs some {weight_kg:.0f} kg, less than the scale can tell from none; it is "
@@ -310,6 +310,20 @@ class LoadBookkeeping:
                 tally.given_up[number] = job.failure
         elif number is not None and self._world.record_miss(number, for_good):
             tally.given_up[number] = job.failure
+
+    def book_unseen(self, job: Activity, now_ns: int) -> None:
+        """Book a grasp of logs that neither the scale nor a picture has shown: they stay on the map, unconfirmed."""
+        assert job.grasp is not None
+        self.tally.missed += 1
+        for log in job.grasp.logs:
+            self.tally.remark(
+                now_ns,
+                f"no picture showed log {log.id} in the jaws, and it is too light to weigh: it is not counted, and is "
+                "looked for again where it lay; it may lie in the bunk",
+            )
+            number = self._world.map_number(log.id)
+            if number is not None and self._world.record_miss(number):
+                self.tally.given_up[number] = f"no picture showed log {log.id} in the jaws, again and again"
 
     def book_unloaded(self, job: Activity) -> bool:
         """Book a finished grasp from the bunk; return whether it failed."""

@@ -15,7 +15,7 @@ from itertools import product
 from statistics import fmean, median
 from typing import Final
 
-from autonomy.manager.tally import volume_m3
+from autonomy.grasp.weight import green_kg
 from autonomy.perception.log_list import LogObservation
 
 WINDOW_NS: Final = 2_000_000_000
@@ -27,9 +27,7 @@ SETTLED_NS: Final = 3_500_000_000
 MIN_LOAD_KG: Final = 30.0
 """Least mean reading of a loaded grapple; friction of the lift reads about half."""
 MIN_LOAD_SHARE: Final = 0.3
-"""Of light logs this share of their weight is enough, ..."""
-GREEN_KG_M3: Final = 900.0
-"""... with the density of green wood (birch 850 to 950, `docs/reference/machines.md`)."""
+"""Of light logs this share of their weight is enough."""
 SCALE_SIGMA_KG: Final = 15.0
 """1-sigma of a mean reading (`controller.crane.load.LoadEstimator`: friction of some 20 kg at 5 m)."""
 UNKNOWN_WOOD_SIGMA, KNOWN_WOOD_SIGMA = 0.20, 0.12
@@ -45,11 +43,6 @@ EXTRA_COST: Final = 12.0
 """... and with a log beside the grasp that nobody meant to grip."""
 MAX_JUDGED: Final = 10
 """Logs of one grasp, and beside it, whose combinations are compared."""
-
-
-def expected_kg(log: LogObservation) -> float:
-    """Estimate the weight of a log of green wood by its size."""
-    return GREEN_KG_M3 * volume_m3(log.length_m, log.diameter_m)
 
 
 class WoodScale:
@@ -106,8 +99,8 @@ class LoadDetector:
     def __init__(
         self, logs: Sequence[LogObservation], beside: Sequence[LogObservation] = (), wood: WoodScale | None = None
     ) -> None:
-        self._meant_kg = {log.id: expected_kg(log) for log in logs}
-        self._beside_kg = {log.id: expected_kg(log) for log in beside}
+        self._meant_kg = {log.id: green_kg(log) for log in logs}
+        self._beside_kg = {log.id: green_kg(log) for log in beside}
         self._wood = wood or WoodScale()
         self._min_load_kg = min(MIN_LOAD_KG, MIN_LOAD_SHARE * sum(self._meant_kg.values()))
         self._readings: deque[tuple[int, float]] = deque()

@@ -82,6 +82,10 @@ class LogMemory:
         if count:
             del self._in_bunk[-count:]
 
+    def leave(self) -> None:
+        """Forget what the job has released: it never hung in the jaws, and lies where it lay."""
+        self._released = []
+
     def correct(self, load: LogObservation, report: StateReport) -> None:
         """Let the load hang as a camera sees it, in the base frame: what the jaws hold turns with it about the pin."""
         if not self._held:
@@ -161,7 +165,8 @@ class LogMemory:
 
     def _judge(self, detector: LoadDetector) -> None:
         """Judge the load by its weight: logs that the weight does not explain still lie where they lay."""
-        if detector.is_empty:
+        assert self._job is not None
+        if detector.is_empty and not self._job.judged_by_picture:
             self._held, self._load_detector, self._slipped = {}, None, True
         elif explained_logs := {number: log for number, log in self._held.items() if number in detector.gripped}:
             self._held = explained_logs

@@ -24,9 +24,12 @@ from autonomy.manager.transition_table import State
 from autonomy.missions.model import ForwardingMission, Point
 from autonomy.motion.arm_kinematics import Arm, Pose
 from autonomy.perception.log_list import LogObservation
+from can_dbc.messages.crane import StateReport
+from machine.joints import Joint
 from machine.loading.profile_file import load_profile
-from tests.autonomy.crane_stand_in import over_bunk
-from tests.autonomy.manager_missions import begin, ended, whole
+from tests.autonomy.crane_stand_in import StandIn, over_bunk
+from tests.autonomy.forwarder_stand_in import Forwarder
+from tests.autonomy.manager_missions import PLANE, begin, ended, managed, whole
 from tests.autonomy.mapped_logs import base, lying, seen
 from tests.codes import numbers_in
 
@@ -56,7 +59,7 @@ class Hands:
         self.memory, self.field, self.now_ns = LogMemory(PROFILE), field, 0
         self.load_kg = math.nan
         self.grasp = grasp_of(field.logs[:meant])
-        self.job: Any = SimpleNamespace(grasp=self.grasp, phase=Phase.LOOK, failure=None)
+        self.job: Any = SimpleNamespace(grasp=self.grasp, phase=Phase.LOOK, judged_by_picture=False, failure=None)
         self.to(self.grasp.pose)
 
     def to(self, pose: Pose) -> None:
@@ -135,6 +138,23 @@ def test_a_log_that_the_scale_does_not_detect_stays_on_the_ground() -> None:
         (log,) = hands.step()
     assert log.center_m == pytest.approx(hands.grasp.log.center_m, abs=1e-6)
     assert hands.memory.in_bunk == 0
+
+
+def test_a_load_that_only_a_picture_can_judge_hangs_whatever_the_scale_reads() -> None:
+    """A log of 20 kg reads 3 kg one time in six: the jaws opened on the way, and it fell."""
+    hands = Hands(field_of((-4.0, 3.0)))
+    hands.job.judged_by_picture = True
+    assert hands.place(load_kg=0.0) == [hands.grasp.log.id]
+
+
+def test_a_load_that_no_picture_showed_is_not_remembered_in_the_bunk() -> None:
+    for leaves in (False, True):
+        hands = Hands(field_of((-4.0, 3.0)))
+        hands.place(load_kg=90.0)
+        if leaves:
+            hands.memory.leave()
+        hands.memory.log_list(hands.now_ns, hands.field, HERE, None, None)
+        assert hands.memory.in_bunk == (not leaves)
 
 
 def test_a_short_low_reading_does_not_lose_the_log() -> None:
@@ -247,6 +267,17 @@ def test_a_log_beside_the_grasp_that_came_up_is_on_board() -> None:
     assert hands.memory.in_bunk == 2
 
 
+class UnsensedJaws(StandIn):
+    """Neither rotator nor opening is measured; ``empty_kg``: what the scale reads of nothing."""
+
+    empty_kg = 0.0
+
+    def report(self) -> StateReport:
+        said = super().report()
+        load_kg = said.load_kg if self.held is not None else self.empty_kg
+        return replace(said, position=(*said.position[: Joint.ROT], math.nan), load_kg=load_kg)
+
+
 class Books:
     """Bookkeeping of a mission without landings, and looks into the bunk."""
 
@@ -267,10 +298,10 @@ class Books:
         self.load = LoadBookkeeping(PROFILE, told, self.world)
         self.now_ns = 0
 
-    def book(self, *diameters_m: float) -> None:
+    def book(self, *diameters_m: float, is_seen: bool = False) -> None:
         logs = [replace(lying(7 + i, -4.0, 3.0 + i, 0.0), diameter_m=d) for i, d in enumerate(diameters_m)]
         self.now_ns += PERIOD_NS
-        self.load.book_loaded(SimpleNamespace(grasp=grasp_of(logs), failure=None), self.now_ns)
+        self.load.book_loaded(SimpleNamespace(grasp=grasp_of(logs), judged_by_picture=is_seen, failure=None), self.now_ns)
 
     def look(self, in_bunk: int, times: int = LOOKS, driven_m: float = 5.0) -> None:
         for _ in range(times):
@@ -342,10 +373,27 @@ def test_what_the_scale_says_of_a_grip_is_booked_and_said() -> None:
     books.world.grip = Grip((), (), 12.0)
     books.book(0.11)
     assert books.load.tally.loaded == 4 and numbers_in(books.said()[2])[0] == 7
+    books.world.grip = Grip((), (), 12.0)
+    books.book(0.11, is_seen=True)
+    assert books.load.tally.loaded == 5 and len(books.said()) == 3, "a picture showed it"
     field = books.field = books.world.log_map = field_of((-4.0, 3.0), (-4.0, 30.0))
     books.world.map_number, books.world.grip = {7: 1, 8: 2}.get, Grip((), (8,), 95.0)
     books.book(0.25, 0.25)
-    assert books.load.tally.loaded == 5 and [log.number for log in field.logs] == [2], "it still lies there"
+    assert books.load.tally.loaded == 6 and [log.number for log in field.logs] == [2], "it still lies there"
+
+
+def test_a_log_that_neither_scale_nor_picture_has_shown_is_not_counted_and_stays_on_the_map() -> None:
+    books = Books()
+    field = books.field = books.world.log_map = field_of((-4.0, 3.0))
+    books.world.record_miss = lambda number: field.record_miss(number) >= 3
+    (log,) = field.logs
+    job: Any = SimpleNamespace(grasp=grasp_of([log]))
+    for times in (1, 2, 3):
+        books.load.book_unseen(job, times)
+        assert (books.load.tally.loaded, books.load.tally.on_board, books.load.tally.missed) == (0, 0, times)
+        assert bool(books.load.tally.given_up) is (times == 3)
+    assert field.get(log.number) is not None and not field.logs, "it must be seen there again"
+    assert [numbers_in(text)[0] for text in books.said()] == [log.number] * 3
 
 
 @pytest.mark.parametrize(("bed_m", "is_high"), [(0.3, False), (0.9, True)])
@@ -395,6 +443,39 @@ def test_a_log_that_falls_off_the_machine_is_counted_and_loaded_again() -> None:
     assert manager.tally.loaded == 0
     forwarder.run(manager, ended)
     assert manager.state is State.DONE and manager.tally.loaded == forwarder.in_bunk == 2
+
+
+class Ahead(Forwarder):
+    """Its only camera looks ahead: it lists logs while the machine drives, and a load that is shown to it."""
+
+    manager: Any = None
+    asked = 0
+
+    def seen(self) -> tuple[LogObservation, ...] | None:
+        if self.manager is None or self.manager.standpoint(self.crane.now_ns) is None:
+            return None
+        if not self.manager.shows_load:
+            return super().seen()
+        self.asked += 1
+        return tuple(log for log in self.crane.logs if log.id == self.crane.held)
+
+
+@whole
+@pytest.mark.parametrize("slips", [False, True])
+def test_a_thin_log_is_counted_by_its_picture_whatever_the_scale_reads(slips: bool) -> None:
+    """20 kg, of which the scale reads 3 where it hangs, and 8 where nothing does."""
+    thin = replace(lying(1, 15.0, 4.2, 0.0), diameter_m=0.12)
+    machine = Ahead(PROFILE, PLANE, [thin], (0.0, 0.1, 0.05))
+    machine.crane = UnsensedJaws(PROFILE, [], q=machine.crane.q, feedback=False, slippery=9 * slips)
+    machine.crane.empty_kg, machine.crane.log_kg = 8.0, 3.0
+    way = (Point(*PLANE.geodetic(10.0, 0.0)[:2]), Point(*PLANE.geodetic(26.0, 0.0)[:2]))
+    machine.manager = manager = managed(ForwardingMission("test", way), plane=PLANE, uses_memory=True)
+    machine.run(manager, lambda m: bool(m.tally.loaded or m.tally.missed))
+    assert machine.asked and (manager.tally.loaded, manager.tally.missed) == ((0, 1) if slips else (1, 0))
+    machine.run(manager, lambda m: m.state is State.STOW)
+    machine.steps(manager, 10)
+    assert manager.tally.loaded == machine.in_bunk == manager.log_memory.in_bunk
+    assert (manager.world.log_map.get(1) is not None) is slips
 
 
 # -- a log that fell off the machine

@@ -18,17 +18,21 @@ from autonomy.crane_job.activity import Activity
 from autonomy.crane_job.rotator_estimate import (
     AHEAD_RAD,
     SCALE_BOUNDS,
+    THIN_SIGMA_RAD,
     UNSURE_AHEAD_RAD,
     UNSURE_RAD,
+    VIEW_SIGMA_RAD,
     RotatorEstimate,
     has_no_encoder,
     load_in_view,
     load_view,
     planning_profile,
+    view_sigma_rad,
 )
 from autonomy.grasp.bunk_load import lies_in_bunk
 from autonomy.grasp.planner import Grasp
-from autonomy.grasp.selection import select_direct
+from autonomy.grasp.selection import plan_single_log_grasp, select_direct
+from autonomy.missions.crane_job import CraneJob
 from autonomy.motion.arm_kinematics import Arm, Pose
 from autonomy.perception.camera.frame import optical_pose
 from autonomy.perception.log_list import LogObservation
@@ -200,15 +204,92 @@ def test_a_load_that_no_picture_shows_is_laid_down_all_the_same_and_said() -> No
     assert planner.done and planner.load_unseen, planner.failure
 
 
-def test_a_bundle_is_not_held_before_the_camera_and_nobody_waits_for_its_picture() -> None:
+SURE = RotatorEstimate(covariance=(1e-4, 0.0, 0.0, 1e-4, 0.0, 1e-4))
+THIN_BIRCH = replace(
+    birch(0), diameter_m=0.12, center_m=(*birch(0).center_m[:2], FORWARDER.workspace.ground_z_m + 0.06)
+)
+
+
+class Photographed(Blind):
+    """Its camera ahead shows what it holds, turned by ``askew_rad``; nothing where ``pictures`` is False."""
+
+    askew_rad, pictures, asked = 0.0, True, 0
+
+    def step(self, activity: Activity) -> bytes | None:
+        data = super().step(activity)
+        if activity.shows_load:
+            self.asked += 1
+            c, s = cos(self.askew_rad), sin(self.askew_rad)
+            held = [
+                replace(log, axis=(c * log.axis[0] - s * log.axis[1], s * log.axis[0] + c * log.axis[1], 0.0))
+                for log in self.logs
+                if log.id == self.held
+            ]
+            activity.view_load(tuple(held) if self.pictures else ())
+        return data
+
+
+def shown(log: LogObservation, **told) -> tuple[Photographed, Activity]:
+    """A job whose rotator is sure, at its end."""
+    crane = Photographed(FORWARDER, [log], q=HOME)
+    for name, value in told.items():
+        setattr(crane, name, value)
+    planner = activity(profile=FORWARDER, view=load_view(FORWARDER, 0.0), rotator=SURE)
+    crane.run(planner)
+    assert planner.done, planner.failure
+    return crane, planner
+
+
+@pytest.mark.parametrize(("log", "asks"), [(birch(0), False), (THIN_BIRCH, True)], ids=["weighed", "too light"])
+def test_a_load_that_is_too_light_to_weigh_is_shown_although_the_rotator_is_sure(log, asks: bool) -> None:
+    crane, planner = shown(log)
+    assert bool(crane.asked) is planner.judged_by_picture is asks and not planner.load_missing
+
+
+def test_a_rotator_with_an_encoder_needs_no_picture_but_for_a_light_load() -> None:
+    joints = {
+        **FORWARDER.joints,
+        "rot": msgspec.structs.replace(FORWARDER.joints["rot"], encoder=LOADER.joints["rot"].encoder),
+    }
+    machine = msgspec.structs.replace(FORWARDER, joints=joints)
+    view = load_view(machine, 0.0)
+    assert view is not None and not view.is_needed(RotatorEstimate(covariance=(9.0, 0.0, 0.0, 1.0, 0.0, 1.0)), 3.0)
+    crane = Photographed(machine, [THIN_BIRCH], q=HOME, feedback=False)
+    crane.askew_rad = 0.4
+    crane.report = lambda: replace(StandIn.report(crane), opening_pct=nan)  # type: ignore[method-assign]
+    planner = activity(profile=machine, view=view)
+    before = planner.rotator
+    crane.run(planner)
+    assert planner.done and crane.asked and planner.rotator == before and not planner.load_missing, planner.failure
+
+
+def test_a_light_load_that_no_picture_shows_is_laid_down_and_missing() -> None:
+    crane, planner = shown(THIN_BIRCH, pictures=False)
+    assert crane.asked and planner.load_missing
+
+
+def test_a_thin_log_that_lies_askew_in_the_jaws_is_not_blamed_on_the_rotator() -> None:
+    straight, askew = (shown(THIN_BIRCH, askew_rad=off)[1].rotator for off in (0.0, 0.4))
+    assert abs(askew.angle(askew.sent_rad) - straight.angle(askew.sent_rad)) < 0.02
+    assert view_sigma_rad(0.12) == THIN_SIGMA_RAD > VIEW_SIGMA_RAD == view_sigma_rad(0.25)
+
+
+def test_a_load_from_the_bunk_is_not_shown_for_its_weight_and_a_bundle_never() -> None:
+    planner = activity(profile=FORWARDER, view=load_view(FORWARDER, 0.0))
+    cycle = planner._cycle
+    cycle.grasp = plan_single_log_grasp(ARM, THIN_BIRCH, 0.0)
+    assert cycle.is_too_light
+    cycle._job = CraneJob(source=FORWARDER.bunk, target=FORWARDER.bunk)
+    assert not cycle.is_too_light
+    crane = Photographed(FORWARDER, [birch(0)], q=HOME)
+
     def bundle(*told) -> Grasp:
         grasp = select_direct(*told)
         return replace(grasp, top_z_m=grasp.log.center_m[2] + 0.125)
 
-    crane = Blind(FORWARDER, [birch(0)], q=HOME)
     planner = activity(profile=FORWARDER, view=load_view(FORWARDER, 0.0), grasp_selector=bundle)
     crane.run(planner)
-    assert planner.done and planner.grasp.is_bundle and not planner.load_unseen, planner.failure
+    assert planner.done and not crane.asked and not planner.load_unseen, planner.failure
 
 
 def test_a_turn_there_and_back_does_not_end_where_it_began() -> None:
