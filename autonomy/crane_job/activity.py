@@ -27,8 +27,8 @@ from autonomy.crane_job.rotator_estimate import (
     has_no_encoder,
     load_in_view,
     planning_profile,
+    play_rad,
     rotator_angle_of_hanging_log,
-    view_sigma_rad,
 )
 from autonomy.crane_job.trajectory_tracker import BRAKE_S, TrajectoryTracker
 from autonomy.grasp.grapple_heights import VERIFY_LIFT_M
@@ -94,6 +94,7 @@ class ActivityState:
         self._stream = SetpointStream(profile_hash, lease_ns, key)
         self._inbox = Inbox(self._profile)
         self._cycle = Cycle(self._profile, job or CraneJob(), motion_planner, grasp_selector, self._inbox, slope)
+        self._cycle.sees_bunk = view is None
         self._grapple = GrappleSequence(self._profile, self._inbox)
         self._tracker = TrajectoryTracker(profile, last_setpoint)
         self._elapsed_s = 0.0
@@ -595,8 +596,8 @@ class Activity(ActivityState):
         assert self.grasp is not None
         counts = self._count.to_counts(self._tracker.setpoint)
         stands = rotator_angle_of_hanging_log(self._profile, load, slew_rad)
-        sigma_rad = view_sigma_rad(self.grasp.thinnest_m)
-        self.rotator = self._count = self.rotator.corrected(counts[Joint.ROT], stands, sigma_rad)
+        play = play_rad(self.grasp.thinnest_m)
+        self.rotator = self._count = self.rotator.corrected(counts[Joint.ROT], stands, play)
         self._tracker.begin(hold(self._count.to_angles(counts)))
         # A rotator that proves slower than its count takes a faster count for the same turn: plan slower turns.
         self._profile = planning_profile(self._machine, self._count)
@@ -614,7 +615,9 @@ class Activity(ActivityState):
         if seen is not None and self._counts and self._view is None:
             q = self._position()
             stands = rotator_angle_of_hanging_log(self._profile, seen, q[Joint.SLEW])
-            self.rotator = self.rotator.corrected(self._count.sent(q[Joint.ROT]), stands)
+            assert self.grasp is not None
+            play = play_rad(self.grasp.thinnest_m)
+            self.rotator = self.rotator.corrected(self._count.sent(q[Joint.ROT]), stands, play)
 
 
 def _problem(error: Unreachable | NoGrasp) -> Problem:

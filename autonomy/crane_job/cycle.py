@@ -39,7 +39,7 @@ from autonomy.crane_job.phase_motions import (
     turn_motion,
 )
 from autonomy.crane_job.phases import Phase
-from autonomy.crane_job.rotator_estimate import LoadView, has_no_encoder
+from autonomy.crane_job.rotator_estimate import LoadView, has_no_encoder, play_rad
 from autonomy.grasp.bunk_load import lies_in_bunk, plan_place
 from autonomy.grasp.grapple_heights import VERIFY_LIFT_M, retreat_height_m, travel_height_m
 from autonomy.grasp.planner import Grasp, GraspSelector, NoGrasp
@@ -135,6 +135,8 @@ class Cycle:
         """Slew angles [rad] from which the crane has yet to look; None before it looks aside."""
         self.view: LoadView | None = None
         """Where the next lift shows its load to a camera; None: it goes straight to its place."""
+        self.sees_bunk = True
+        """Whether pictures show how the load hangs above its place."""
         self._turn_count = 0
         """Turns of a thin load above its place."""
         self._higher_count = 0
@@ -415,7 +417,8 @@ class Cycle:
         stands_rad: float | None = None,
     ) -> Pose:
         knows_load = self._motion_planner.knows_load
-        return plan_place(arm, self._job, grasp, logs, held_yaw_rad, stands_rad, knows_load=knows_load)
+        askew_rad = 0.0 if self.sees_bunk else play_rad(grasp.thinnest_m)
+        return plan_place(arm, self._job, grasp, logs, held_yaw_rad, stands_rad, knows_load, askew_rad)
 
     def _hanging_kg(self, phase: Phase) -> float:
         """Return the load that bends the crane in a phase, kg: that of a lifted log, otherwise 0."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from math import atan2, pi, remainder, sqrt
+from math import atan2, copysign, pi, remainder, sqrt
 from typing import Final
 
 import numpy as np
@@ -37,8 +37,10 @@ TURN_SIGMA_RAD: Final = 0.04
 """1-sigma of what a turn of 1 rad adds that the next one does not: dead-band, load and oil differ."""
 VIEW_SIGMA_RAD: Final = 0.08
 """1-sigma of a viewed angle: a log may hang a little askew, and its axis is measured to 4 degrees."""
-THIN_SIGMA_RAD: Final = 0.35
-"""The same of a thin log: it may lie askew in closed jaws (0.5 rad were seen), whatever the rotator does."""
+PLAY_RAD_M: Final = 6.0
+"""For each metre by which a log is thinner than `THICK_LOG_M` it may lie askew in closed jaws by so much: they do not
+clasp it, and when the rotator stops it swings on (measured on the plant: 0.37 rad with 12 cm, 0.28 with 15, 0.12 with
+16, none with 18)."""
 SCALE_BOUNDS: Final = (0.6, 1.5)
 ROUNDING_RAD: Final = 1e-9
 
@@ -94,14 +96,15 @@ class RotatorEstimate:
         aa += TURN_SIGMA_RAD**2 * abs(turn)
         return RotatorEstimate(sent_rad, self.angle(sent_rad), self.paces, (aa, an, ap, nn, np, pp))
 
-    def corrected(self, sent_rad: float, angle_rad: float, sigma_rad: float = VIEW_SIGMA_RAD) -> RotatorEstimate:
+    def corrected(self, sent_rad: float, angle_rad: float, play_rad: float = 0.0) -> RotatorEstimate:
         """Return the estimate after the rotator was viewed at an angle, modulo pi, at this count.
 
-        ``sigma_rad``: 1-sigma of the view.
+        ``play_rad``: by which what was viewed may lie askew in the jaws; within that it says nothing of the rotator.
         """
         now = self.turned(sent_rad)
         aa, an, ap, nn, np, pp = now.covariance
-        off, spread = remainder(angle_rad - now.angle_rad, pi), aa + sigma_rad**2
+        off, spread = remainder(angle_rad - now.angle_rad, pi), aa + VIEW_SIGMA_RAD**2 + play_rad**2
+        off = copysign(max(abs(off) - play_rad, 0.0), off)
         # A grapple turned by pi looks the same: keep the estimate near the count and within its range.
         near = sent_rad + remainder(now.angle_rad + aa / spread * off - sent_rad, pi)
         least, most = SCALE_BOUNDS
@@ -178,9 +181,9 @@ def rotator_angle_of_hanging_log(profile: Profile, log: LogObservation, slew_rad
     return atan2(log.axis[1], log.axis[0]) + pi / 2 - straight
 
 
-def view_sigma_rad(thinnest_m: float) -> float:
-    """Return the 1-sigma of a rotator that is viewed by its load: a thin log may lie askew in the jaws."""
-    return VIEW_SIGMA_RAD if thinnest_m >= THICK_LOG_M else THIN_SIGMA_RAD
+def play_rad(thinnest_m: float) -> float:
+    """Return by how much a log of this diameter may lie askew in closed jaws to either side."""
+    return PLAY_RAD_M * max(THICK_LOG_M - thinnest_m, 0.0)
 
 
 # -- Shows a load to the camera ahead of the machine, so that a rotator without an encoder is measured.

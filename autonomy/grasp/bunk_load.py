@@ -222,13 +222,15 @@ def plan_place(
     held_yaw_rad: float | None = None,
     stands_rad: float | None = None,
     knows_load: bool = True,
+    askew_rad: float = 0.0,
 ) -> Pose:
     """Plan the pose of the pin in which the grapple may open over the bunk.
 
     ``held_yaw_rad`` is the grapple's yaw while the log was seen to hang in it.  A thin log may lie askew in closed
     jaws: the rotator turns so that the log, not the grapple, lies along the bunk.  Of the turns that differ by half a
     turn it makes the one that ends nearest to ``stands_rad``, its angle by then; None: that of the grasp.  Without
-    ``knows_load`` the log may lie above the stakes.
+    ``knows_load`` the log may lie above the stakes.  ``askew_rad``: by which it may lie askew in the jaws, unseen; it
+    is laid so far from the stakes that its ends stay between them.
 
     Raises:
         BunkFull: the log would lie above the stakes.
@@ -240,6 +242,7 @@ def plan_place(
     load = BunkLoad(bunk, [o for o in logs if o.id not in taken], thickest, grasp.log.length_m, arm.slope)
     highest_m = top - BELOW_STAKE_TOP_M
     reach_m = bunk.width_m / 2 - max(thickest / 2 + STAKE_CLEARANCE_M, GRAPPLE_STAKE_CLEARANCE_M)
+    reach_m = max(reach_m - 0.5 * grasp.log.length_m * sin(askew_rad), 0.0)
     rest = load.lowest_place(reach_m, highest_m)
     c, s = cos(bunk.yaw_rad), sin(bunk.yaw_rad)
     center_x, center_y = bunk.center_m[0] - rest.across_m * s, bunk.center_m[1] + rest.across_m * c

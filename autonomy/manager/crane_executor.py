@@ -14,7 +14,7 @@ from msgspec.structs import replace
 
 from autonomy.crane_job.activity import KEPT, Activity
 from autonomy.crane_job.phases import Phase
-from autonomy.crane_job.rotator_estimate import LoadView, RotatorEstimate, load_view
+from autonomy.crane_job.rotator_estimate import LoadView, RotatorEstimate, load_view, play_rad
 from autonomy.grasp.bunk_load import lies_in_bunk
 from autonomy.grasp.planner import Grasp, GraspSelector
 from autonomy.grasp.weight import UNSURE_KG
@@ -159,7 +159,9 @@ class CraneExecutor:
     def view_load(self, logs: Sequence[LogObservation]) -> None:
         """Accept the logs of a picture that was taken while `shows_load`, in the base frame."""
         assert self.job is not None and self._log_memory is not None and self._world.report is not None
-        if (load := self.job.view_load(tuple(logs))) is not None:
+        load, grasp = self.job.view_load(tuple(logs)), self.job.grasp
+        # How a thin log lies in the jaws by then, it does not lie in them after the next turn.
+        if load is not None and grasp is not None and not play_rad(grasp.thinnest_m):
             self._log_memory.correct(load, self._world.report)
 
     def abort(self, reason: str) -> None:

@@ -301,7 +301,9 @@ class Books:
     def book(self, *diameters_m: float, is_seen: bool = False) -> None:
         logs = [replace(lying(7 + i, -4.0, 3.0 + i, 0.0), diameter_m=d) for i, d in enumerate(diameters_m)]
         self.now_ns += PERIOD_NS
-        self.load.book_loaded(SimpleNamespace(grasp=grasp_of(logs), judged_by_picture=is_seen, failure=None), self.now_ns)
+        self.load.book_loaded(
+            SimpleNamespace(grasp=grasp_of(logs), judged_by_picture=is_seen, failure=None), self.now_ns
+        )
 
     def look(self, in_bunk: int, times: int = LOOKS, driven_m: float = 5.0) -> None:
         for _ in range(times):

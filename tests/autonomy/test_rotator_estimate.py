@@ -18,7 +18,6 @@ from autonomy.crane_job.activity import Activity
 from autonomy.crane_job.rotator_estimate import (
     AHEAD_RAD,
     SCALE_BOUNDS,
-    THIN_SIGMA_RAD,
     UNSURE_AHEAD_RAD,
     UNSURE_RAD,
     VIEW_SIGMA_RAD,
@@ -27,9 +26,9 @@ from autonomy.crane_job.rotator_estimate import (
     load_in_view,
     load_view,
     planning_profile,
-    view_sigma_rad,
+    play_rad,
 )
-from autonomy.grasp.bunk_load import lies_in_bunk
+from autonomy.grasp.bunk_load import lies_in_bunk, plan_place, point_in_bunk
 from autonomy.grasp.planner import Grasp
 from autonomy.grasp.selection import plan_single_log_grasp, select_direct
 from autonomy.missions.crane_job import CraneJob
@@ -269,9 +268,30 @@ def test_a_light_load_that_no_picture_shows_is_laid_down_and_missing() -> None:
 
 
 def test_a_thin_log_that_lies_askew_in_the_jaws_is_not_blamed_on_the_rotator() -> None:
+    """It was: the rotator was thought to stand 0.2 rad off, and the log came to lie across the stakes."""
     straight, askew = (shown(THIN_BIRCH, askew_rad=off)[1].rotator for off in (0.0, 0.4))
-    assert abs(askew.angle(askew.sent_rad) - straight.angle(askew.sent_rad)) < 0.02
-    assert view_sigma_rad(0.12) == THIN_SIGMA_RAD > VIEW_SIGMA_RAD == view_sigma_rad(0.25)
+    assert askew.angle(askew.sent_rad) == pytest.approx(straight.angle(askew.sent_rad), abs=0.01)
+    rotator, play = RotatorEstimate(covariance=(1.0, 0.0, 0.0, 0.0, 0.0, 0.0)), play_rad(0.12)
+    assert [play_rad(d) for d in (0.12, 0.2, 0.3)] == pytest.approx([0.48, 0.0, 0.0])
+    assert rotator.corrected(0.0, play, play).angle_rad == 0.0
+    assert 0.1 < rotator.corrected(0.0, play + 0.3, play).angle_rad < 0.3
+    assert VIEW_SIGMA_RAD < rotator.corrected(0.0, 0.0, play).sigma_rad < play < rotator.sigma_rad
+
+
+def test_a_log_that_may_lie_askew_unseen_is_laid_so_far_from_the_stakes_that_its_ends_stay_between_them() -> None:
+    bunk, across_m = FORWARDER.bunk, {}
+    z = bunk.floor_z_m + 0.15
+    middle = [
+        replace(birch(0), id=10 + i, center_m=(bunk.center_m[0], y, z), axis=(1.0, 0.0, 0.0), diameter_m=0.3)
+        for i, y in enumerate((-0.3, 0.0, 0.3))
+    ]
+    for askew_rad in (0.0, play_rad(THIN_BIRCH.diameter_m)):
+        grasp = plan_single_log_grasp(ARM, THIN_BIRCH, 0.0)
+        pose = plan_place(ARM, CraneJob(), grasp, middle, askew_rad=askew_rad)
+        across_m[askew_rad] = abs(point_in_bunk(bunk, *ARM.xy(pose))[1])
+    clasped_m, loose_m = across_m.values()
+    assert clasped_m > 0.45, "on the floor beside the others"
+    assert loose_m + 0.5 * THIN_BIRCH.length_m * sin(askew_rad) < 0.5 * bunk.width_m
 
 
 def test_a_load_from_the_bunk_is_not_shown_for_its_weight_and_a_bundle_never() -> None:
