@@ -58,6 +58,9 @@ _RELEASED_KG: Final = 30.0
 _PUSH_LOAD_KG, _PUSH_FACTOR = 250.0, 1.5
 """Jaws that afterwards bear more than this, and this many times what hung in them, push against logs or stakes and lift
 the crane; a rebound bears less."""
+_OPENS_AGAIN: Final = 2
+"""Jaws without a sensor that gave way, and still bear their load, open again this often: a log that falls within them
+as they open weighs nothing for a moment, and more than twice its weight in the next."""
 _UNDER_LOG_SHARE: Final = 0.85
 """The tips are under a log when their gap is less than this share of its diameter."""
 _STILL_BAND_PCT, _STILL_S = 0.5, 0.8
@@ -138,11 +141,15 @@ class GrappleSequence:
         self._mean_kg = nan
         self.laden_kg = self._resting_s = 0.0
         """``laden_kg``: what hung in the jaws when the crane set out for the place."""
+        self._again_count = 0
         self._has_let_go = self.is_obstructed = False
         """Whether the opening jaws push against something; only a load cell tells."""
 
     def release(self, dt_s: float) -> None:
         """Open for one tick of ``dt_s``; jaws that push close until they no longer do, and then hold still."""
+        if self._opens_again:
+            self._again_count += 1
+            self._opening_s, self._has_let_go, self.is_obstructed = 0.0, False, False
         gives_way = self.is_obstructed and self._is_pushing
         back = GrappleCommand.CLOSE if gives_way else GrappleCommand.NEUTRAL
         self.apply(back if self.is_obstructed else GrappleCommand.OPEN, dt_s, gives_way)
@@ -158,7 +165,7 @@ class GrappleSequence:
         if gives_way or command in (GrappleCommand.OPEN, GrappleCommand.NEUTRAL):
             self._sense_load(dt_s)
         else:
-            self._held_kg, self._has_let_go, self.is_obstructed = self._load_kg, False, False
+            self._held_kg, self._has_let_go, self.is_obstructed, self._again_count = self._load_kg, False, False, 0
         if command is GrappleCommand.OPEN:
             self._opening_s += dt_s
         elif command is not GrappleCommand.NEUTRAL:
@@ -231,7 +238,16 @@ class GrappleSequence:
     @property
     def has_kept_load(self) -> bool:
         """Whether opened jaws that have risen still bear a good part of the load."""
-        return self._mean_kg > max(_RELEASED_KG, _KEPT_SHARE * self.laden_kg)
+        return self._bears_load(self._mean_kg)
+
+    def _bears_load(self, kg: float) -> bool:
+        return kg > max(_RELEASED_KG, _KEPT_SHARE * self.laden_kg)
+
+    @property
+    def _opens_again(self) -> bool:
+        """Whether jaws that gave way and are at rest shall open again: only the load cell tells, and reads a load."""
+        stopped = self.is_obstructed and self._since_push_s > _STILL_S and self._again_count < _OPENS_AGAIN
+        return stopped and self.may_keep_load and self.has_kept_load and self._bears_load(self._load_kg)
 
     @property
     def lifts_nothing(self) -> bool:
@@ -269,7 +285,8 @@ class GrappleSequence:
         until they pushed against something, given way, and the crane has swung out.
         """
         if self.is_obstructed:
-            return self._since_push_s > _STILL_S and not self._encloses(grasp)
+            return self._since_push_s > _STILL_S and not self._opens_again and not self._encloses(grasp)
+        opening_s = self._opening_s if self._again_count else opening_s
         return has_released(self._profile, self._inbox.report, grasp, opening_s)
 
     def must_open_higher(self, grasp: Grasp) -> bool:

@@ -168,6 +168,36 @@ def test_opening_jaws_that_bear_a_load_push(loads_kg: tuple[float, ...], pushed:
 
 
 @pytest.mark.parametrize(
+    ("opening_pct", "laden_kg", "rests_kg", "again"),
+    [
+        (nan, 131.0, 120.0, 2),
+        (nan, 131.0, 20.0, 0),  # it fell out
+        (nan, 50.0, 45.0, 0),  # too light to tell
+        (30.0, 131.0, 120.0, 0),  # a sensor tells how far they have opened
+    ],
+)
+def test_jaws_in_which_the_log_fell_as_they_opened_open_again(opening_pct, laden_kg, rests_kg, again) -> None:
+    """It read 28 and then 404 kg, taken for a push: they stopped, and the mission failed with the log in them."""
+    sequence, held = sequence_at(opening_pct), grasp(0.25)
+    sequence.laden_kg = laden_kg
+    for load_kg in (laden_kg, 28.0, 404.0, 30.0):
+        weighs(sequence, load_kg, GrappleCommand.OPEN)
+    assert sequence.is_obstructed
+    opened = 0
+    for _ in range(4):
+        for _ in range(40):
+            weighs(sequence, rests_kg, sequence.command)
+            before = sequence.is_obstructed
+            sequence.release(0.05)
+            opened += before and sequence.command is GrappleCommand.OPEN
+            if before and not sequence.is_obstructed:
+                assert not sequence.has_released(held, 10.0), "the jaws have only begun to open"
+        for load_kg in (28.0, 404.0, 30.0):
+            weighs(sequence, load_kg, GrappleCommand.OPEN)
+    assert opened == again
+
+
+@pytest.mark.parametrize(
     ("opening_pct", "others", "higher"), [(30.0, 0, True), (95.0, 0, False), (30.0, 1, False), (nan, 0, False)]
 )
 def test_jaws_that_pushed_and_still_enclose_the_log_must_open_higher(opening_pct, others, higher) -> None:
