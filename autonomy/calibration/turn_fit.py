@@ -35,8 +35,9 @@ DEADBAND_STARTS: Final = (0.04, 0.1, 0.18, 0.28)
 HOLD_BOUNDS_S: Final = (0.2, 3.0)
 """Bounds of a pulse's hold time."""
 MAX_PULSE_S: Final = 4.7
-"""Longest pulse: the controller ends a test of a joint without an encoder after five seconds.  A slow valve takes one
-second to open far enough, and one to close."""
+"""Longest pulse: the controller ends a test of a joint without an encoder after five seconds."""
+LOWER: Final = 0.9
+"""A share of the speed limit whose pulse takes longer is lowered by this, until it does not."""
 SIDES: Final = (1, -1)
 
 
@@ -106,6 +107,10 @@ def pulse_to(
     """Plan the pulse that should end at an angle, counted as ``angle_rad``."""
     known, allowed = fit.side(side), allowed or allowed_by(spec)
     spec = fitted_spec(spec, fit)
+    least, most = HOLD_BOUNDS_S
+    # A valve that opens slowly would take longer to a great opening and back than a test may: a lesser one serves.
+    while pulse(spec, side, share, least, allowed).duration_s > MAX_PULSE_S:
+        share *= LOWER
 
     def turn_rad(hold_s: float) -> float:
         program = pulse(spec, side, share, hold_s, allowed)
@@ -115,7 +120,6 @@ def pulse_to(
 
     shut, held = turn_rad(0.0), turn_rad(1.0)
     target_turn_rad = side * (to_rad - fit.angle_rad)
-    least, most = HOLD_BOUNDS_S
     most = max(least, min(most, MAX_PULSE_S - pulse(spec, side, share, 0.0, allowed).duration_s))
     hold_s = (target_turn_rad - shut) / (held - shut) if held > shut else most
     return pulse(spec, side, share, min(max(hold_s, least), most), allowed)

@@ -289,11 +289,13 @@ def test_single_readings_of_a_person_are_plausible() -> None:
     assert max(errors_of(result.turns, SLOW_PLUS)[1]) < 0.1
 
 
-@pytest.mark.parametrize(("deadband", "full"), [(0.03, 0.67), (0.18, 0.67), (0.3, 0.67), (0.3, 6.0)])
+@pytest.mark.parametrize(("deadband", "full"), [(0.03, 0.67), (0.052, 0.8), (0.18, 0.67), (0.3, 0.67), (0.3, 6.0)])
 def test_no_pulse_lasts_longer_than_the_controller_lets_one(deadband: float, full: float) -> None:
-    slow = SideFit(deadband, full, (0.01, 0.1))
+    """The opening grows as slowly as the faster side needs it: a slow one beside it was stopped."""
+    slow, fast = SideFit(deadband, full, (0.01, 0.1)), SideFit(0.097, 4.25, (0.01, 0.1))
     for share, far in PULSES:
-        assert pulse_to(ROT, TurnFit(slow, slow), 1, share, far).duration_s < 1e-9 * MAX_OPEN_UNSENSED_NS
+        for fit in (TurnFit(slow, slow), TurnFit(slow, fast)):
+            assert pulse_to(ROT, fit, 1, share, far).duration_s < 1e-9 * MAX_OPEN_UNSENSED_NS
 
 
 def test_without_turns_a_side_keeps_the_profiles_values() -> None:
