@@ -27,7 +27,9 @@ than this times what was seen of them, up to 2.4 times; the lift watches its loa
 
 
 def wood_kg(logs: Iterable[LogObservation]) -> float:
-    """Compute the weight of logs by their measured sizes [kg]."""
+    """Compute the weight of logs by their measured sizes [kg], of the wood for which grasps are rated; the scale is
+    compared with `green_kg`.
+    """
     return sum(DENSITY_KG_M3 * pi * (log.diameter_m / 2.0) ** 2 * log.length_m for log in logs)
 
 
